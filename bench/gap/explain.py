@@ -309,9 +309,18 @@ class _Explainer:
 
     def _search(self, base: Base, rng: np.random.Generator) -> Search:
         given = self.fitting, self.noise, base.frozen, rng, self.floor.stated
-        search = Search(*given, thorough=self.thorough)
+        search = self._kind_of_search()(*given, thorough=self.thorough)
         search.enter(base.fit)
         return search
+
+    def _kind_of_search(self) -> type[Search]:
+        """Search by prediction errors where the simulator can be linearised."""
+        if not self.kind.has_model:
+            return Search
+        # Loaded where there is a robot alone.
+        from bench.gap.prediction_error.search import PredictionErrorSearch
+
+        return PredictionErrorSearch
 
     def _base(self) -> Base:
         """The base model; of a robot with the step that the data ask for, the file's or a finer
@@ -323,9 +332,23 @@ class _Explainer:
             self.faults = (fault,) if fault is not None else ()
         if self.faults or not self.kind.has_model:
             return base
-        base = self._frozen(self._stepped(base))
+        if self._shows_steps(base):
+            base = self._stepped(base)
+        base = self._frozen(base)
         # What is asked about as a cause comes first: it would not be seen afterwards.
         return without_step(self.fitting, self.noise, base)
+
+    def _shows_steps(self, base: Base) -> bool:
+        """Whether the recording shows what the engine's steps miss."""
+        if self.watch.left() or not np.isfinite(base.fit.cost):
+            return True
+        # Loaded where there is a robot alone.
+        from bench.gap.prediction_error.identification import needs_correction
+        from bench.gap.prediction_error.search import PredictionErrorSearch
+
+        search = self._search(base, self._rng())
+        assert isinstance(search, PredictionErrorSearch)
+        return needs_correction(search.follow())
 
     def _frozen(self, base: Base) -> Base:
         """The base model without free numbers of the robot that the data cannot fix.

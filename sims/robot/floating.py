@@ -126,6 +126,20 @@ class Floating:
                 result[:, turn] = _product(pose[:, turn], small[None])
         return result
 
+    def displaced(self, pose: Array, moves: Array) -> Array:
+        """Return poses (n, P) after small moves (n, F), by (1)."""
+        result = pose.copy()
+        for axes, turn, first in self._own:
+            place = slice(turn.start - len(axes), turn.start)
+            result[:, place] += moves[:, first : first + len(axes)]
+            rotation = moves[:, first + len(axes) : first + len(axes) + len(SPIN)]
+            angle = np.linalg.norm(rotation, axis=1, keepdims=True)
+            # sin(a / 2) / a, which is 1 / 2 at zero.
+            half = 0.5 * np.sinc(angle / (2.0 * np.pi))
+            small = np.concatenate([np.cos(0.5 * angle), half * rotation], axis=1)
+            result[:, turn] = _product(pose[:, turn], small)
+        return result
+
     def apart(self, pose: Array, reference: Array) -> Array:
         """(n, F) the moves that lead from reference poses (n, P) to poses."""
         parts = []

@@ -75,6 +75,7 @@ class Instants:
         places: addresses of the joints.
         drives: of each output the number of the joint of which it is what drives exert; -1 of
             others.
+        held: seconds over which what is found at an instant holds.
 
     Attributes:
         motion, acting: as given.
@@ -94,6 +95,7 @@ class Instants:
         outputs: Sequence[tuple[str, int]],
         places: Addresses,
         drives: Sequence[int] = (),
+        held: float = HELD,
     ) -> None:
         self.motion, self.acting = motion, acting
         self._bench, self._system = bench, system
@@ -103,7 +105,7 @@ class Instants:
         self._exerted = np.zeros((0, 0))
         self._floating = bench.floating
         self._dofs = np.append(places.velocities, self._floating.velocities)
-        self.every = max(round(HELD / motion.step), 1)
+        self.every = max(round(held / motion.step), 1)
         self.numbers, self.of = _looked_at(motion, self.every)
         # What is bound after a call is not there before the next one.
         self._bind(bench)
@@ -132,19 +134,21 @@ class Instants:
         return bool((self._drives < 0).any())
 
     def reached(
-        self, moved: Mapping[str, tuple[int, float]], acting: Acting
+        self, moved: Mapping[str, tuple[int, float]], acting: Acting, steps: int = 1
     ) -> tuple[Array, Array]:
         """States (N, Z) and readings (N, O) after a step from each instant.
 
         Args:
             moved: one column of what it begins with, and by how much.
             acting: effects whose elements are in the model.
+            steps: number of steps, of lanes with shorter ones.
         """
         states, readings = [], []
         bind, places, floating = self._bench.batch.bind, self._places, self._floating
         begin = 0
         for n, ids in self._placed(moved, acting):
-            self._bench.batch.step(ids)
+            for _ in range(steps):
+                self._bench.batch.step(ids)
             parts = [bind("qpos")[:n, places.positions], bind("qvel")[:n, places.velocities]]
             if self.motion.act.shape[1]:
                 parts.append(bind("act")[:n])
@@ -280,6 +284,16 @@ class Instants:
             yield
         finally:
             self._bench, self._fresh = own
+
+    @contextmanager
+    def every_step(self) -> Iterator[None]:
+        """Look at every step, not only at those in which quotients are taken."""
+        own = self.numbers
+        self.numbers = np.arange(len(self.motion.controls))
+        try:
+            yield
+        finally:
+            self.numbers = own
 
     def inertias(self) -> Array:
         """(N, E, E) of all that moves at each instant that is looked at."""

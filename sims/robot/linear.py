@@ -13,7 +13,7 @@ from sims.base import Array, Scenario
 from sims.robot.felt import INSTANT
 from sims.robot.felt import felt as felt_over
 from sims.robot.floating import Afloat
-from sims.robot.instants import Instants, Motion
+from sims.robot.instants import HELD, Instants, Motion
 from sims.robot.midway import ends, midways
 from sims.robot.native import FIELDS
 from sims.robot.quiet import quiet
@@ -21,7 +21,7 @@ from sims.robot.sampling import keeps_time, places, read, sampled
 from sims.robot.scales import floating_forces, scales
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
-from sims.robot.tangent import TOGETHER, Change, Tangent
+from sims.robot.tangent import TOGETHER, Change, Quotients, Tangent
 from sims.robot.work import Work
 from sims.simulated import Simulated
 from sims.system import Acting, Effect, Input, Sensor
@@ -43,7 +43,15 @@ class Linear:
         scenario: of the run.
         x: (D,) initial positions.
         v: (D,) initial velocities.
+
+    Attributes:
+        held: seconds over which difference quotients hold.
+        quotients: difference quotients of another motion nearby, to be used again.
+        observed: (T, C) the observations of the run.
     """
+
+    held = HELD
+    quotients: Quotients | None = None
 
     def __init__(
         self, simulator: Simulated, theta: Array, scenario: Scenario, x: Array, v: Array
@@ -123,9 +131,10 @@ class Linear:
             outputs,
             bench.whole,
             [self._driven_joint(name) for name in self._names],
+            self.held,
         )
         sizes = np.concatenate([sizes, sizes[second], floating_forces(simulator.robot)])
-        return Tangent(at, sizes)
+        return Tangent(at, sizes, self.quotients)
 
     def _driven_joint(self, channel: str) -> int:
         """The number of the joint of which a channel shows what drives exert; -1 of others."""

@@ -265,6 +265,16 @@ class RobotSimulator(Simulated):
         (series,) = by_series(acting, 1)
         return self._bench(True, WIDTH, series)
 
+    def half_steps(self, acting: Acting = ()) -> Bench:
+        """Return the lanes of `wide` with half the time step."""
+        (series,) = by_series(acting, 1)
+        engine = self.engine
+        assert isinstance(engine, RobotEngine)
+        settings = dict(engine.numerics.settings())
+        settings["timestep"] *= 0.5
+        robot = in_series(self.robot, series) if series else self.robot
+        return Bench(robot, True, settings, WIDTH)
+
     def stepped(self, work: Work, given: Given, more: Sequence[str] = ()) -> Made:
         """Step lanes of one run, whatever acts on them.
 

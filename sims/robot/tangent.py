@@ -89,9 +89,10 @@ class Tangent:
     Args:
         at: its instants.
         sizes: (E,) typical forces.
+        quotients: those of another motion nearby; taken of this one where None.
     """
 
-    def __init__(self, at: Instants, sizes: Array) -> None:
+    def __init__(self, at: Instants, sizes: Array, quotients: Quotients | None = None) -> None:
         self._at, self._motion = at, at.motion
         self._sizes = sizes
         self._steps = len(at.motion.controls)
@@ -99,7 +100,7 @@ class Tangent:
         self._share: Array = (numbers - at.numbers[at.of]) / at.every
         self._earlier, self._later = _neighbours(at.numbers, at.every)[:, at.of]
         self._base, self._read = at.reached({}, at.acting)
-        self.quotients = self._quotients()
+        self.quotients = quotients or self._quotients()
         # Accelerations and readings of the motion itself.
         self._still = at.accelerated(at.acting)
 
@@ -200,6 +201,32 @@ class Tangent:
         """
         q = self.quotients
         size, joints = q.forces.shape[1:]
+        steps = self._steps
+        pushed, read = self.pushed(changes, count)
+        # States, forces and controls below each other, so that a step is one product.
+        whole = np.zeros((steps + 1, size + pushed.shape[1], count))
+        whole[:-1, size:] = pushed
+        step = list(np.concatenate([q.states, q.forces, q.controls], axis=2))
+        rows = list(whole)
+        for t, look in enumerate(self._at.of.tolist()):
+            np.matmul(step[look], rows[t], out=rows[t + 1][:size])  # (2)
+        if read.shape[1]:
+            read += np.matmul(q.read_states[self._at.of], whole[:-1, :size])
+        states = whole[:, :size]
+        return np.moveaxis(states, 2, 0), np.moveaxis(read, 2, 0)
+
+    def pushed(self, changes: Sequence[Change], count: int) -> tuple[Array, Array]:
+        """Compute what changes add to forces and controls, and to readings directly.
+
+        Args:
+            changes: with owners from 0 to `count` - 1.
+            count: number of owners n.
+
+        Returns:
+            Forces and controls (S, E + nu, n); readings (S, O, n) at unchanged states.
+        """
+        q = self.quotients
+        joints = q.forces.shape[2]
         steps, actuators, outputs = self._steps, q.controls.shape[2], self._read.shape[1]
         # An owner's series lie together while they are added up.
         pushed = np.zeros((joints + actuators, count, steps))
@@ -218,22 +245,70 @@ class Tangent:
                 pushed[:joints, owner] += self._between(change.forces).T
             if change.readings is not None:
                 read[:, :, owner] += self._between(change.readings)
-        # States, forces and controls below each other, so that a step is one product.
-        whole = np.zeros((steps + 1, size + joints + actuators, count))
-        whole[:-1, size:] = pushed.transpose(2, 0, 1)
-        step = list(np.concatenate([q.states, q.forces, q.controls], axis=2))
-        rows = list(whole)
-        for t, look in enumerate(self._at.of.tolist()):
-            np.matmul(step[look], rows[t], out=rows[t + 1][:size])  # (2)
+        whole = np.ascontiguousarray(pushed.transpose(2, 0, 1))
         if outputs:
+            forces = whole[:, :joints].copy()
             # What numbers of the model change about readings is in them already.
-            whole[:, size : size + joints, self._numbered(changes, count)] = 0.0
-            seen = np.concatenate([q.read_states, q.read_forces], axis=2)
-            read += np.matmul(seen[self._at.of], whole[:-1, : size + joints])
+            forces[:, :, self._numbered(changes, count)] = 0.0
+            read += np.matmul(q.read_forces[self._at.of], forces)
             instants = np.ascontiguousarray(at_once.transpose(2, 0, 1))
             read += np.matmul(q.read_controls[self._at.of], instants)
-        states = whole[:, :size]
-        return np.moveaxis(states, 2, 0), np.moveaxis(read, 2, 0)
+        return whole, read
+
+    @property
+    def looked_at(self) -> Places:
+        """(S,) for each step the number of the instant whose quotients hold there."""
+        return self._at.of
+
+    @property
+    def looks_at(self) -> int:
+        """Number N of instants at which quotients are taken."""
+        return int(self._at.numbers.size)
+
+    @property
+    def remembering(self) -> Sequence[int]:
+        """Numbers of the effects that have states of their own."""
+        return self._at.remembering
+
+    @property
+    def motion_readings(self) -> Array:
+        """(S, O) readings in the motion at the beginnings of steps, as the model gives them."""
+        motion, of = self._motion, self._at.of
+        with self._at.every_step():
+            _, read = self._at.accelerated(self._at.acting)
+        # A step has the mean of a command, which a sensor does not show.
+        apart = motion.instant - motion.controls
+        result: Array = read + np.einsum("sou,su->so", self.quotients.read_controls[of], apart)
+        return result
+
+    def step_errors(self, finer: Bench) -> Array:
+        """Estimate what a step of the integrator misses, (N, Z), by Richardson's extrapolation.
+
+        Two steps of half the length leave half the error of one step of a method of first order (L.
+        F. Richardson, 1911, doi:10.1098/rsta.1911.0009).
+
+        Args:
+            finer: lanes with half the time step.
+        """
+        with self._at.on(finer):
+            state, _ = self._at.reached({}, self._at.acting, steps=2)
+        return 2.0 * (state - self._base)
+
+    @cached_property
+    def defects(self) -> Array:
+        """(S, Z) by how much the motion misses the model's step from each of its states."""
+        motion, joints = self._motion, self._motion.x.shape[1]
+        with self._at.every_step():
+            base, _ = self._at.reached({}, self._at.acting)
+        result = np.zeros_like(base)
+        result[:, :joints] = motion.x[1:] - base[:, :joints]
+        result[:, joints : 2 * joints] = motion.v[1:] - base[:, joints : 2 * joints]
+        moves = motion.afloat.rate.shape[1]
+        if moves:
+            # Moves are counted from the motion itself.
+            result[:, -2 * moves : -moves] = -base[:, -2 * moves : -moves]
+            result[:, -moves:] = motion.afloat.rate[1:] - base[:, -moves:]
+        return result
 
     def _between(self, values: Array) -> Array:
         """(S, k) of values (N, k) at the instants that are looked at, linear from one to the next

@@ -104,7 +104,7 @@ class _Inquiry:
             left = remains(search, base)
             return Finding(verdict_of(State(fixed=False)), base, base, (), left, vague)
         self._watch.begin("search")
-        self._model = sought(search)
+        self._model = search.run() if search.world.linear else sought(search)
         self._watch.begin("rivals")
         self._model = search.plainer(settle(search, self._model))
         self._model = search.to_the_end(self._model)

@@ -138,6 +138,10 @@ def remains(models: Models, model: Model) -> Remains:
     if not any(probe.name in world.slots for probe in (Hat, JointHat)):
         return quick
     world.watch.look("a force of any shape")
+    known = models.force_of_any_shape(model)
+    if known is not None:
+        level = level_of(bool(stated.all()))
+        return Remains(known[0], known[1], quick.excess, quick.loud, level)
     model = models.exact(model)
     directions = hats(world, model)
     if not directions.probes:
@@ -185,24 +189,30 @@ def _error(models: Models, model: Model, channel: int) -> float:
 
 def hats(world: World, model: Model) -> Directions:
     """What hats over every recorded variable would change about a model."""
-    labels, added = [], []
-    size = SIZE * TYPICAL[world.simulator.system.kind]
-    for label, low, high, coefficients in _shapes(world, size):
-        # At this spacing each hat reaches to the centres of its neighbours.
-        width = (high - low) / (BINS - 1)
-        for centre in np.linspace(low, high, BINS):
-            labels.append(label)
-            added.append(coefficients(centre, width))
+    probes, size = hat_probes(world)
+    names = [JointHat.name if JointHat.name in world.slots else Hat.name] * len(probes)
+    added = [(name, probe.c) for name, probe in zip(names, probes, strict=True)]
     changed = changes_by(world, model.fit, added)
     values = np.nan_to_num(np.moveaxis(changed, 0, -1)) / size
     # A hat where no run ever is changes nothing, and would be a column of zeros.
     acting = np.flatnonzero(np.abs(values).max(axis=(0, 1, 2)) > 0)
-    # One label for a family: its hats are one hypothesis, and act together.
+    return Directions(tuple(probes[i] for i in acting), values[..., acting])
+
+
+def hat_probes(world: World) -> tuple[list[Probe], float]:
+    """Hats over every recorded variable, and the strength that they have.
+
+    One label for a family: its hats are one hypothesis, and act together.
+    """
+    size = SIZE * TYPICAL[world.simulator.system.kind]
     probes = []
-    for i in acting:
-        _, c = added[i]
-        probes.append(Probe(labels[i], group=0, place=0, c=c, signed=True))
-    return Directions(tuple(probes), values[..., acting])
+    for label, low, high, coefficients in _shapes(world, size):
+        # At this spacing each hat reaches to the centres of its neighbours.
+        width = (high - low) / (BINS - 1)
+        for centre in np.linspace(low, high, BINS):
+            _, c = coefficients(centre, width)
+            probes.append(Probe(label, group=0, place=0, c=c, signed=True))
+    return probes, size
 
 
 Shape = Callable[[float, float], tuple[str, Array]]

@@ -144,6 +144,12 @@ class Models:
         merit = found.value - free * self.price - chance  # (1)
         return Model(fit, found, merit)
 
+    def force_of_any_shape(self, model: Model) -> tuple[float, str] | None:
+        """Return the p-value of the best force of any shape, and what it follows; None where that
+        is asked by simulation.
+        """
+        return None
+
     def replaced(self, key: frozenset[str]) -> None:
         """Called when a model has taken the place of another."""
 

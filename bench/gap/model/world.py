@@ -87,6 +87,8 @@ class World:
         derivatives: (R, T, C, s) by initial states, where they have been taken from a tangent.
         neighbourhoods: of runs of a robot, that were asked for last (`bench.gap.model.tangents`).
         simulated: what effects without a tangent change about them, by name and coefficients.
+        followed: the runs of a robot as a filter follows them, if it does
+            (`bench.gap.prediction_error.candidate_responses`).
         crew: who simulates and fits; this process alone, unless another is put here.
 
     Args:
@@ -157,6 +159,7 @@ class World:
         self.correction: Array | None = None
         self.neighbourhoods: dict[tuple[int, bytes, bytes], Any] = {}
         self.simulated: dict[tuple[str, bytes], Array] = {}
+        self.followed: Any = None
         self.simulations = 0
         self._cache = LaneCache()
         self.watch = Watch()

@@ -1,0 +1,335 @@
+"""Responses of the innovations to every candidate effect, carried through the filter's recursion.
+
+With gain K and whitener W of the filter (`bench.gap.prediction_error.state_estimation`), a unit of
+candidate k, which adds b to states and ψ to readings (`sims.robot.measured`, eqs. (3) and (4)),
+changes the predicted state by s and the whitened innovations by -w:
+
+    u_i = ψ_i + H_i s_i,    w_i = W_i u_i,    s_{i+1} = A_i (s_i - K_i u_i) + b_i               (1)
+
+so that the innovations are e = Σ_k c_k w_k + white noise, linear in the coefficients however large
+they are, since the motion about which the model is linear is the measured one (L. Ljung, System
+Identification, 2nd ed., 1999, chapter 3; K. J. Åström, Automatica 16, 551, 1980,
+doi:10.1016/0005-1098(80)90078-3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.gap.causes.candidates import Probe
+from bench.gap.model.noise import Noise
+from bench.gap.model.world import World
+from bench.gap.prediction_error.measured_states import measured_states
+from bench.gap.prediction_error.state_estimation import (
+    SMALLEST_FORCE,
+    Filtered,
+    LinearRuns,
+    Places,
+    Smoothed,
+    filter_runs,
+    fit_process_noise,
+    with_coloured_noise,
+)
+from sims.base import Array
+from sims.robot.measured import IntervalMaps, MeasuredLinear, Trajectory
+from sims.robot.scales import floating_forces, scales
+from sims.robot.simulator import RobotSimulator
+from sims.system import Effect
+
+POSITION_PRIOR, VELOCITY_PRIOR = 1.0, 10.0
+"""Standard deviations of the first states about the measured motion, rad or m, and per second."""
+UNMEASURED_PRIOR = 0.3
+"""The same of positions that are not recorded."""
+FIRST_FORCE = 0.1
+"""Missing force from which the fit of the process noise begins, as a share of a typical force."""
+RELINEARISED = 2
+"""Number of times the motion is smoothed and the model linearised about it again."""
+
+CORRELATIONS = (0.4, 0.6, 0.75, 0.85, 0.92, 0.96)
+"""Correlations of AR(1) sensor noise that are tried one after another while they gain."""
+COLOURED = 5.0
+"""Log likelihood that a larger correlation must gain."""
+SIDE_BY_SIDE = 256
+"""Number of columns that go through the filter together, so that they stay in the cache."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What candidates add to the states and readings of R runs.
+
+    Attributes:
+        probes: of the K candidates.
+        places: (K,) the column of each; candidates that act alike share one.
+        sizes: (K,) the coefficient that each probe has.
+        pushed: (R, T - 1, E + nu, M) mean forces and controls of M columns between samples.
+        readings: ψ (R, T, C, M).
+    """
+
+    probes: tuple[Probe, ...]
+    places: Places
+    sizes: Array
+    pushed: Array
+    readings: Array
+
+    def joined(self, others: Columns) -> Columns:
+        """Return these candidates with others behind them."""
+        return Columns(
+            self.probes + others.probes,
+            np.concatenate([self.places, others.places + self.pushed.shape[3]]),
+            np.concatenate([self.sizes, others.sizes]),
+            np.concatenate([self.pushed, others.pushed], axis=3),
+            np.concatenate([self.readings, others.readings], axis=3),
+        )
+
+    def total(self, chosen: Sequence[int], coefficients: Array) -> tuple[Array, Array]:
+        """Return what chosen candidates add together: forces and controls (R, T - 1, E + nu), and ψ
+        (R, T, C).
+
+        Args:
+            chosen: numbers of probes.
+            coefficients: of each.
+        """
+        own = self.places[list(chosen)]
+        weights = coefficients / self.sizes[list(chosen)]
+        return self.pushed[..., own] @ weights, self.readings[..., own] @ weights
+
+
+@dataclass
+class FollowedRuns:
+    """Runs of a robot that a filter with the model follows.
+
+    Attributes:
+        world: the runs.
+        theta: (P,) parameters of the model.
+        noise: of the sensors.
+        linear: the linearised model of each run.
+        runs: the linear models, stacked, without states for coloured noise.
+        force: (E,) standard deviations of the missing forces.
+        filtered: what the filter gives.
+        smoothed: what the smoother gives.
+        typical: (E,) typical forces.
+    """
+
+    world: World
+    theta: Array
+    noise: Noise
+    linear: list[MeasuredLinear]
+    runs: LinearRuns
+    force: Array
+    filtered: Filtered
+    smoothed: Smoothed
+    typical: Array
+
+    @classmethod
+    def follow(
+        cls, world: World, theta: Array, noise: Noise, trajectories: Sequence[Trajectory] | None
+    ) -> FollowedRuns:
+        """Linearise a model about the measured motion and filter the runs.
+
+        Args:
+            world: the runs.
+            theta: (P,) parameters of the model.
+            noise: of the sensors.
+            trajectories: the motion of each run, if it has been estimated before.
+        """
+        again = RELINEARISED if trajectories is None else 1
+        followed: FollowedRuns | None = None
+        force: Array | None = None
+        linear: list[MeasuredLinear] = []
+        for _ in range(again):
+            # Jacobians change little from one motion to another near the data.
+            nearby = linear or [None] * len(world.tracks)
+            linear = [
+                _linearised(world, theta, noise, run, trajectories and trajectories[run], near)
+                for run, near in enumerate(nearby)
+            ]
+            maps = [one.interval_maps() for one in linear]
+            followed = cls._filtered(world, theta, noise, linear, maps, force)
+            force, noise = followed.force, followed.noise
+            trajectories = followed.trajectories()
+        assert followed is not None
+        return followed
+
+    @classmethod
+    def _filtered(
+        cls,
+        world: World,
+        theta: Array,
+        noise: Noise,
+        linear: list[MeasuredLinear],
+        maps: list[IntervalMaps],
+        force: Array | None,
+    ) -> FollowedRuns:
+        assert isinstance(world.simulator, RobotSimulator)
+        size = maps[0].states.shape[1]
+        robot = world.simulator.robot
+        typical = np.concatenate([scales(robot).force, floating_forces(robot)])
+        runs = LinearRuns.stacked(maps, world.observed, _prior(world, size))
+        begin = FIRST_FORCE * typical if force is None else force
+        followed = cls(world, theta, noise, linear, runs, begin, _NONE, _NOTHING, typical)
+        return followed.refitted(runs)
+
+    def refitted(self, runs: LinearRuns) -> FollowedRuns:
+        """Return the filter of changed linear models, with the process noise and the correlation
+        of the sensor noise fitted again.
+        """
+        coloured, white = with_coloured_noise(runs, self.noise)
+        force, filtered, smoothed = fit_process_noise(coloured, self.force, white, self.typical)
+        noise, best = self.noise, float(filtered.log_likelihood.sum())
+        for phi in CORRELATIONS:
+            if phi <= float(noise.phi.max(initial=0.0)):
+                continue
+            other = Noise(noise.sigma, np.full_like(noise.phi, phi))
+            coloured, white = with_coloured_noise(runs, other)
+            found = filter_runs(coloured, force, white)
+            likelihood = float(found.log_likelihood.sum())
+            if likelihood < best + COLOURED:
+                break
+            force, filtered, smoothed = fit_process_noise(coloured, force, white, self.typical)
+            noise, best = other, float(filtered.log_likelihood.sum())
+        return replace(
+            self, runs=runs, noise=noise, force=force, filtered=filtered, smoothed=smoothed
+        )
+
+    def needs_process_noise(self) -> Array:
+        """Return by how much twice the log likelihood falls without each missing force, (E,)."""
+        coloured, white = with_coloured_noise(self.runs, self.noise)
+        best = float(self.filtered.log_likelihood.sum())
+        losses = []
+        for j in range(self.force.size):
+            force = self.force.copy()
+            force[j] = SMALLEST_FORCE * self.typical[j]
+            found = filter_runs(coloured, force, white)
+            losses.append(2.0 * (best - float(found.log_likelihood.sum())))
+        return np.array(losses)
+
+    def trajectories(self) -> list[Trajectory]:
+        """Return the smoothed motion of each run."""
+        size = self.runs.prior.size
+        found = []
+        for run, linear in enumerate(self.linear):
+            count = linear.knots.size
+            states = self.smoothed.states[run, :count, :size]
+            forces = self.smoothed.forces[run, : count - 1, : self.force.size]
+            found.append(linear.moved(linear.propagated(states, forces)))
+        return found
+
+    def columns(self, probes: Sequence[Probe]) -> Columns:
+        """Compute what candidates add to states and readings, each effect at one place once.
+
+        Args:
+            probes: of the candidates.
+        """
+        effects: list[tuple[Effect, Array]] = []
+        known: dict[tuple[str, bytes], int] = {}
+        places = []
+        for probe in probes:
+            effect, c = self.world.effects[probe.effect], probe.c
+            parts = [(one, k) for one, k in effect.parts(c[:, None, None]) if k.any()]
+            # A member of a family acts as it does alone.
+            if len(parts) == 1:
+                effect, c = parts[0][0], parts[0][1][:, 0, 0]
+            key = effect.name, c.tobytes()
+            if key not in known:
+                known[key] = len(effects)
+                effects.append((effect, c))
+            places.append(known[key])
+        number, samples, channels = self.runs.residuals.shape
+        inputs = self.runs.inputs.shape[3]
+        pushed = np.zeros((number, samples - 1, inputs, len(effects)), dtype=np.float32)
+        readings = np.zeros((number, samples, channels, len(effects)), dtype=np.float32)
+        for run, linear in enumerate(self.linear):
+            own, read = linear.added(effects)
+            pushed[run, : own.shape[0]] = own
+            readings[run, : read.shape[0]] = read
+        readings[~self.runs.recorded] = 0.0
+        fine = np.isfinite(pushed).all(axis=(0, 1, 2)) & np.isfinite(readings).all(axis=(0, 1, 2))
+        pushed[..., ~fine], readings[..., ~fine] = 0.0, 0.0
+        sizes = np.array([1.0 if p.fixed else p.c[p.place] for p in probes])
+        return Columns(tuple(probes), np.array(places, dtype=np.intp), sizes, pushed, readings)
+
+    def step_error_response(self) -> Array:
+        """Return the whitened response (R, T, C) to the errors of the integrator's steps."""
+        missed = self.runs.step_errors[..., None].astype(np.float32)
+        nothing = np.zeros((*self.runs.residuals.shape, 1), dtype=np.float32)
+        return self._through_filter(missed, nothing)[..., 0]
+
+    def responses(self, columns: Columns) -> Array:
+        """Carry columns through the filter by (1): whitened responses (R, T, C, K), in units of
+        the probes' coefficients.
+        """
+        inputs = self.runs.inputs.astype(np.float32)
+        found = self._through_filter(columns.pushed, columns.readings, inputs)
+        return found[..., columns.places] / columns.sizes.astype(np.float32)
+
+    def _through_filter(
+        self, pushed: Array, readings: Array, inputs: Array | None = None
+    ) -> Array:
+        """Carry columns through (1).
+
+        Args:
+            pushed: (R, T - 1, E + nu, M) forces and controls, or states where `inputs` is None.
+            readings: ψ (R, T, C, M).
+            inputs: (R, T - 1, Z, E + nu) what makes b of them.
+        """
+        coloured, _ = with_coloured_noise(self.runs, self.noise)
+        number, samples, channels, count = readings.shape
+        size = self.runs.prior.size
+        result = np.zeros((number, samples, channels, count), dtype=np.float32)
+        h, a = coloured.readings.astype(np.float32), coloured.states.astype(np.float32)
+        gains = self.filtered.gains.astype(np.float32)
+        whiteners = self.filtered.whiteners.astype(np.float32)
+        for run in range(number):
+            last = int(np.flatnonzero(self.runs.recorded[run].any(axis=1)).max(initial=0))
+            for begin in range(0, count, SIDE_BY_SIDE):
+                part = slice(begin, min(begin + SIDE_BY_SIDE, count))
+                s = np.zeros((a.shape[2], part.stop - part.start), dtype=np.float32)
+                for i in range(last + 1):
+                    u = h[run, i] @ s
+                    u += readings[run, i, :, part]
+                    np.matmul(whiteners[run, i], u, out=result[run, i, :, part])
+                    if i < last:
+                        s -= gains[run, i] @ u
+                        s = a[run, i] @ s
+                        more = pushed[run, i, :, part]
+                        s[:size] += more if inputs is None else inputs[run, i] @ more
+        return result
+
+
+_NONE = Filtered(*(np.zeros(0) for _ in range(6)))
+_NOTHING = Smoothed(*(np.zeros(0) for _ in range(3)))
+"""Stand for what has not been computed yet."""
+
+
+def _linearised(
+    world: World,
+    theta: Array,
+    noise: Noise,
+    run: int,
+    trajectory: Trajectory | None,
+    nearby: MeasuredLinear | None,
+) -> MeasuredLinear:
+    """Linearise the model of one run about a motion, at first that of its readings alone."""
+    half = len(world.states) // 2
+    scenario = world.tracks[run].scenario
+    start = world.guess[run, :half], world.guess[run, half:]
+    given = trajectory
+    if given is None:
+        states = measured_states(world, noise.sigma, run)
+        return MeasuredLinear(world.simulator, theta, scenario, start, measured=states)
+    return MeasuredLinear(world.simulator, theta, scenario, start, given, nearby=nearby)
+
+
+def _prior(world: World, size: int) -> Array:
+    """(Z,) standard deviations of the first states."""
+    coordinates = world.simulator.system.coordinates
+    prior = np.full(size, 1e-9)
+    joints = len(coordinates)
+    for joint, name in enumerate(coordinates):
+        measured = name in world.channels
+        prior[joint] = POSITION_PRIOR if measured else UNMEASURED_PRIOR
+        prior[joints + joint] = VELOCITY_PRIOR
+    return prior

@@ -1,0 +1,159 @@
+"""Find the effects that a robot's model lacks: filter, respond, select, and filter again.
+
+    1. Follow the runs with the model by a Kalman filter about the measured motion.
+    2. Compute the response of the innovations to every candidate effect.
+    3. Select effects by regression, whatever their number.
+    4. Put them into the linear model, fit the process noise again, and go on at 3, since with less
+       process noise the innovations show more.
+    5. While process noise is still needed, offer effects with more shapes as well.
+
+(L. Ljung, System Identification, 2nd ed., 1999, chapters 3, 7 and 16.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bench.gap.causes.gains import Group
+from bench.gap.prediction_error.candidate_responses import Columns, FollowedRuns
+from bench.gap.prediction_error.selection import Regression, groups_of
+from sims.base import Array
+
+PASSES = 4
+"""Maximum number of regressions, each with the process noise that the last selection leaves."""
+SHOWN = 7.0
+"""Twice the log likelihood that the errors of the integrator's steps must gain."""
+MOST = 8
+"""Maximum number of effects in a set."""
+
+
+@dataclass(frozen=True)
+class Selected:
+    """The result of a selection.
+
+    Attributes:
+        groups: the selected groups of columns.
+        coefficients: of each group, in units of the probes' coefficients.
+        regression: the last regression.
+        log_likelihood: of the innovations with the selected effects.
+        followed: the runs, with the selected effects in the linear model.
+        numerics: share of the errors of the integrator's steps in the linear model.
+        shows_steps: whether the innovations show these errors.
+    """
+
+    groups: Sequence[Group]
+    coefficients: Sequence[Array]
+    regression: Regression
+    log_likelihood: float
+    followed: FollowedRuns
+    numerics: float
+    shows_steps: bool
+
+    @property
+    def effects(self) -> list[str]:
+        """Names of the selected effects."""
+        return [group.effect for group in self.groups]
+
+
+def needs_correction(followed: FollowedRuns) -> bool:
+    """Whether the innovations show the errors of the integrator's steps, as they do where the
+    recorded motion is that of continuous time, and not where the engine itself made it.
+    """
+    response = followed.step_error_response().astype(np.float64)
+    power = float(np.square(response).sum())
+    if not power > 0:
+        return False
+    share = float((response * followed.filtered.whitened).sum()) / power
+    return share > 0.5 and share * share * power > SHOWN
+
+
+def identify(followed: FollowedRuns, columns: Columns, most: int = MOST) -> Selected:
+    """Select effects, with the process noise fitted again after each selection.
+
+    Args:
+        followed: the runs, without any effect.
+        columns: of the candidates.
+        most: maximum number of effects.
+    """
+    now, chosen = followed, list[Group]()
+    coefficients: list[Array] = []
+    result: Selected | None = None
+    numerics = 0.0
+    for _ in range(PASSES):
+        regression = regress(now, columns, chosen, coefficients, numerics)
+        selected = regression.pruned(chosen) if chosen else []
+        selected = regression.select(most, selected)
+        _, found = regression.solve(selected)
+        numerics = regression.nuisance(selected)
+        now = with_effects(followed, columns, selected, found, numerics)
+        likelihood = float(now.filtered.log_likelihood.sum())
+        done = result is not None and likelihood < result.log_likelihood + 1.0
+        if result is None or likelihood > result.log_likelihood:
+            result = Selected(
+                selected, found, regression, likelihood, now, numerics, regression.shows_nuisance(selected)
+            )
+        if done:
+            break
+        chosen, coefficients = selected, found
+    assert result is not None
+    return result
+
+
+def regress(
+    now: FollowedRuns,
+    columns: Columns,
+    chosen: Sequence[Group] = (),
+    coefficients: Sequence[Array] = (),
+    numerics: float = 0.0,
+    always: Sequence[int] = (),
+) -> Regression:
+    """Set up the regression of all that effects explain, those in the linear model included.
+
+    Args:
+        now: the runs, filtered with the chosen effects in the linear model.
+        columns: of the candidates.
+        chosen: these effects.
+        coefficients: theirs.
+        numerics: share of the integrator's errors that is in the linear model.
+        always: numbers of probes that are in every set, and candidates no more.
+    """
+    responses = now.responses(columns)
+    number, _, _, count = responses.shape
+    nuisance = now.step_error_response()
+    own = np.array([c for group in chosen for c in group.columns], dtype=np.intp)
+    weights = np.concatenate([*coefficients, np.zeros(0)])
+    grams = np.zeros((number, count + 1, count + 1))
+    crosses, totals = np.zeros((number, count + 1)), np.zeros(number)
+    for run in range(number):
+        rows = responses[run].reshape(-1, count).astype(np.float64)
+        rows = np.concatenate([rows, nuisance[run].reshape(-1, 1)], axis=1)
+        target = now.filtered.whitened[run].reshape(-1)
+        target = target + rows[:, own] @ weights + numerics * rows[:, -1]
+        grams[run] = rows.T @ rows
+        crosses[run] = rows.T @ target
+        totals[run] = target @ target
+    contains = {name: effect.contains for name, effect in now.world.effects.items()}
+    groups = [g for g in groups_of(columns.probes) if not set(g.columns) & set(always)]
+    samples = int(now.runs.recorded.sum())
+    return Regression(groups, grams, crosses, totals, samples, contains, (count, *always))
+
+
+def with_effects(
+    followed: FollowedRuns,
+    columns: Columns,
+    chosen: Sequence[Group],
+    coefficients: Sequence[Array],
+    numerics: float,
+) -> FollowedRuns:
+    """Put effects into the linear model, and fit the process noise again."""
+    own = [c for group in chosen for c in group.columns]
+    runs = followed.runs
+    defects, residuals = runs.defects - numerics * runs.step_errors, runs.residuals
+    if own:
+        pushed, readings = columns.total(own, np.concatenate(list(coefficients)))
+        defects = defects - np.einsum("rtze,rte->rtz", runs.inputs, pushed)
+        residuals = np.where(runs.recorded, residuals - readings, 0.0)
+    return followed.refitted(replace(runs, defects=defects, residuals=residuals))

@@ -1,0 +1,105 @@
+"""States of a robot from its recorded positions and velocities alone, without its dynamics.
+
+Each joint is filtered by itself, as a body whose jerk j is constant between samples and otherwise
+unknown,
+
+    (q, v, a)[i+1] = [[1, h, h²/2], [0, 1, h], [0, 0, 1]] (q, v, a)[i] + (h³/6, h²/2, h) j_i     (1)
+
+(Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation,
+2001, section 6.2), the size of the jerk by maximum likelihood from a grid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bench.gap.model.world import World
+from bench.gap.prediction_error.state_estimation import (
+    LinearRuns,
+    filter_runs,
+    smooth_runs,
+)
+from sims.base import Array
+
+JERKS = 10.0 ** np.arange(-2.0, 3.1, 1.0)
+"""Sizes of the jerk that are tried, in units of the range of positions over seconds cubed."""
+
+
+def measured_states(world: World, sigma: Array, run: int) -> Mapping[int, Array]:
+    """Estimate positions, velocities and accelerations of the recorded joints of one run.
+
+    Args:
+        world: the runs.
+        sigma: (C,) standard deviation of the noise of each channel.
+        run: its number.
+
+    Returns:
+        By number of the joint, (T, 3) at the samples.
+    """
+    coordinates, rates = world.simulator.system.coordinates, world.simulator.system.rates
+    track = world.tracks[run]
+    times, observed = track.scenario.times, track.observed
+    joints, readings = [], []
+    for joint, names in enumerate(zip(coordinates, rates, strict=True)):
+        if names[0] not in world.channels:
+            continue
+        columns = [world.channels.index(n) if n in world.channels else -1 for n in names]
+        values = [observed[:, c] if c >= 0 else np.full(times.size, np.nan) for c in columns]
+        noise = [sigma[c] if c >= 0 else 1.0 for c in columns]
+        if np.isfinite(values[0]).sum() < 3:
+            continue
+        joints.append(joint)
+        readings.append((np.stack(values, axis=1), np.array(noise)))
+    if not joints:
+        return {}
+    found = _tracked(times, readings)
+    return dict(zip(joints, found, strict=True))
+
+
+def _tracked(times: Array, readings: list[tuple[Array, Array]]) -> list[Array]:
+    """Filter and smooth joints by (1), each with the likeliest jerk: (T, 3) each."""
+    steps = np.diff(times)
+    count, samples = len(readings), times.size
+    a = np.tile(np.eye(3), (samples - 1, 1, 1))
+    a[:, 0, 1] = a[:, 1, 2] = steps
+    a[:, 0, 2] = 0.5 * steps**2
+    g = np.stack([steps**3 / 6.0, 0.5 * steps**2, steps], axis=1)[:, :, None]
+    values = np.stack([v for v, _ in readings])
+    # Units of the noise: the two channels then share a variance of one.
+    scale = np.stack([n for _, n in readings])[:, None]
+    first = np.array([v[np.isfinite(v[:, 0]), 0][0] for v, _ in readings])
+    residuals = values.copy()
+    residuals[:, :, 0] -= first[:, None]
+    recorded = np.isfinite(residuals)
+    residuals = np.where(recorded, residuals, 0.0) / scale
+    reading = np.zeros((count, samples, 2, 3))
+    reading[..., 0, 0] = 1.0 / scale[..., 0]
+    reading[..., 1, 1] = 1.0 / scale[..., 1]
+    reading[~recorded] = 0.0
+    sizes = np.array([max(float(np.nanmax(v[:, 0]) - np.nanmin(v[:, 0])), n[0]) for v, n in readings])
+    # A range over the second, or over the time that the run takes where that is less.
+    span = min(float(times[-1] - times[0]), 1.0)
+    prior = np.array([10.0, 10.0 / span, 100.0 / span**2]) * max(float(sizes.max()), 1e-9)
+    levels = JERKS.size
+    runs = LinearRuns(
+        np.tile(a, (count * levels, 1, 1, 1)),
+        np.zeros((count * levels, samples - 1, 3)),
+        np.tile(g, (count * levels, 1, 1, 1)),
+        np.zeros((count * levels, samples - 1, 3, 0)),
+        np.repeat(reading, levels, axis=0),
+        np.repeat(residuals, levels, axis=0),
+        np.repeat(recorded, levels, axis=0),
+        prior,
+        np.zeros((count * levels, samples - 1, 3)),
+    )
+    force = (sizes[:, None] * JERKS / span**3).reshape(-1, 1)
+    filtered = filter_runs(runs, force, np.ones(2))
+    likely = filtered.log_likelihood.reshape(count, levels)
+    chosen = np.argmax(likely, axis=1) + levels * np.arange(count)
+    best = runs.subset(chosen)
+    smoothed = smooth_runs(best, filtered.subset(chosen), force[chosen])
+    found = smoothed.states
+    found[:, :, 0] += first[:, None]
+    return list(found)

@@ -1,0 +1,65 @@
+"""Scores of candidates with what they reach by chance.
+
+Twice the log likelihood that k further coefficients gain where nothing is missing follows a chi
+squared distribution with k degrees of freedom (S. S. Wilks 1938, doi:10.1214/aoms/1177732360). An
+effect that is tried at n shapes takes the best of them, and the library the best of its effects;
+shapes are taken for independent, which overstates what chance reaches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from bench.gap.causes.gains import Group
+from bench.gap.causes.score_test import LUCK, Scores
+from bench.gap.prediction_error.selection import Regression
+
+DRAWS = 200
+"""Number of draws from the null distribution."""
+
+
+def null_scores(
+    regression: Regression, lacking: Collection[str], rng: np.random.Generator
+) -> Scores:
+    """Score effects by a regression.
+
+    Args:
+        regression: about the model that lacks them.
+        lacking: names of the effects to score.
+        rng: draws from the null distribution.
+    """
+    gains = regression.gains([])
+    by_effect: dict[str, list[int]] = {}
+    for i, group in enumerate(regression.groups):
+        if group.effect in lacking:
+            by_effect.setdefault(group.effect, []).append(i)
+    names = list(by_effect)
+    score = np.array([max(gains[i] for i in by_effect[name]) for name in names])
+    chance, drawn, p_values, peaks = [], [], [], []
+    for name, best in zip(names, score.tolist(), strict=True):
+        own = by_effect[name]
+        freedom = max(len(regression.groups[i].columns) for i in own)
+        shapes = len(own)
+        chance.append(float(chdtri(freedom, 1.0 - LUCK ** (1.0 / shapes))))
+        uniform = rng.random(DRAWS) ** (1.0 / shapes)
+        drawn.append(chdtri(freedom, 1.0 - uniform))
+        p_values.append(min(shapes * float(chdtrc(freedom, best)), 1.0))
+        peak: Group = regression.groups[max(own, key=lambda i: gains[i])]
+        peaks.append(((peak, regression.solve([peak])[1][0]),))
+    order = np.argsort(-score, kind="stable")
+    luck = np.array(chance)
+    by_chance = np.array(drawn).reshape(len(names), DRAWS) - luck[:, None]
+    p_value = min(len(names) * min(p_values, default=1.0), 1.0)
+    return Scores(
+        effects=tuple(names[i] for i in order),
+        score=score[order],
+        chance=luck[order],
+        peaks=tuple(peaks[i] for i in order),
+        p_value=p_value,
+        phi=0.0,
+        by_chance=by_chance[order],
+        white=score[order],
+    )

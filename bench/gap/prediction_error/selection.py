@@ -1,0 +1,251 @@
+"""Selection of effects by linear regression of the innovations on the candidates' responses.
+
+With e the whitened innovations of N samples and W the whitened responses of the candidates,
+
+    G = Wᵀ W,   h = Wᵀ e,   rss(S) = eᵀ e - h_Sᵀ G_SS⁻¹ h_S                                     (1)
+
+for the columns S of a set of effects. Effects are added one after another, the one first with which
+N log rss falls most, until none pays
+
+    N log(rss(S) / rss(S ∪ g)) > k log N + 2 log M                                              (2)
+
+with k the number of coefficients of the effect g and M the number of candidates, by which the
+chance of the best of M is bounded (D. P. Foster, E. I. George, Ann. Stat. 22(4), 1947, 1994,
+doi:10.1214/aos/1176325766). After each addition effects that no longer pay are removed again (A.
+Miller, Subset Selection in Regression, 2nd ed., 2002, chapter 3). Nothing is simulated for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bench.gap.causes.candidates import Probe
+from bench.gap.causes.gains import Group, batches, explained
+from sims.base import Array
+
+ALIASED = 1e-7
+"""Share of a column's sum of squares that other columns leave, below which it is one of them."""
+MAJORITY = 0.5
+"""Smallest share of the runs left out that a larger set must predict better."""
+SHOWN = 7.0
+"""Twice the log likelihood that a column must gain to be in the data."""
+RIDGE = 1e-10
+"""Ridge, as a share of each column's sum of squares."""
+SMALLEST_RSS = 1e-9
+"""Smallest residual sum of squares, as a share of the innovations'."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """One effect of a set: a group of columns, such as a law at one of its shapes.
+
+    Attributes:
+        group: its columns.
+        coefficients: of each column, in units of the columns.
+    """
+
+    group: Group
+    coefficients: Array
+
+
+@dataclass
+class Regression:
+    """The regression of innovations on responses.
+
+    Attributes:
+        groups: columns that act together, at most one of each effect in a set.
+        grams: G (R, K, K) of each run.
+        crosses: h (R, K).
+        totals: eᵀ e (R,).
+        count: N.
+        contains: effects that each effect contains, by name.
+        always: columns that are in every set, of no effect.
+    """
+
+    groups: Sequence[Group]
+    grams: Array
+    crosses: Array
+    totals: Array
+    count: int
+    contains: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    always: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.gram, self.cross = self.grams.sum(axis=0), self.crosses.sum(axis=0)
+        self.total = float(self.totals.sum())
+        self._batches = batches(self.groups)
+        self.effects = list(dict.fromkeys(group.effect for group in self.groups))
+        self._nuisance = Group("", self.always, (False,) * len(self.always))
+
+    def nuisance(self, chosen: Sequence[Group]) -> float:
+        """Return the coefficient of the first column that is in every set, beside a set."""
+        _, parts = self._solve([*chosen, self._nuisance])
+        return float(parts[-1][0]) if self.always else 0.0
+
+    def shows_nuisance(self, chosen: Sequence[Group]) -> bool:
+        """Whether the first column that is in every set is in the data, beside a set."""
+        with_it, parts = self._solve([*chosen, self._nuisance])
+        rest = Group("", self.always[1:], (False,) * (len(self.always) - 1))
+        without, _ = self._solve([*chosen, rest])
+        return float(parts[-1][0]) > 0.5 and self.log_ratio(without, with_it) > SHOWN
+
+    def solve(self, chosen: Sequence[Group]) -> tuple[float, list[Array]]:
+        """Fit a set of groups: the residual sum of squares, and the coefficients of each."""
+        rss, parts = self._solve([*chosen, self._nuisance])
+        return rss, parts[:-1]
+
+    def _solve(
+        self, chosen: Sequence[Group], gram: Array | None = None, cross: Array | None = None
+    ) -> tuple[float, list[Array]]:
+        """Fit a set of groups.
+
+        Coefficients that must not be negative are held at zero one after another, the most
+        negative first, while any is.
+        """
+        gram = self.gram if gram is None else gram
+        cross = self.cross if cross is None else cross
+        columns = np.array([c for group in chosen for c in group.columns], dtype=np.intp)
+        positive = np.array([p for group in chosen for p in group.positive], dtype=bool)
+        active = np.ones(columns.size, dtype=bool)
+        solution = np.zeros(columns.size)
+        while active.any():
+            own = columns[active]
+            scale = np.sqrt(np.maximum(np.diagonal(gram)[own], 1e-300))
+            normal = gram[np.ix_(own, own)] / scale / scale[:, None]
+            normal[np.diag_indices_from(normal)] += RIDGE
+            solved = np.linalg.solve(normal, cross[own] / scale)
+            solution[:] = 0.0
+            solution[active] = solved / scale
+            negative = np.flatnonzero(active & positive & (solution < 0))
+            if not negative.size:
+                break
+            sizes = solution[negative] * np.sqrt(np.diagonal(gram)[columns[negative]])
+            active[negative[np.argmin(sizes)]] = False
+            solution[:] = 0.0
+        explained_squares = float(solution @ cross[columns])
+        # At a solution with some coefficients held at zero the same formula holds for the others.
+        rss = max(self.total - explained_squares, SMALLEST_RSS * self.total)
+        parts, begin = [], 0
+        for group in chosen:
+            parts.append(solution[begin : begin + len(group.columns)].copy())
+            begin += len(group.columns)
+        return rss, parts
+
+    def log_ratio(self, before: float, after: float) -> float:
+        """Return twice the gain of the log likelihood, N log(before / after)."""
+        return float(self.count * np.log(before / after))
+
+    def price(self, group: Group) -> float:
+        """Return what an effect must gain, the right side of (2)."""
+        coefficients = len(group.columns) * np.log(max(self.count, 2))
+        return float(coefficients + 2.0 * np.log(max(len(self.effects), 2)))
+
+    def gains(self, chosen: Sequence[Group]) -> Array:
+        """Return what each group gains beside a set, in twice the log likelihood (n,)."""
+        columns = np.array([c for group in chosen for c in group.columns], dtype=np.intp)
+        columns = np.append(columns, np.array(self.always, dtype=np.intp))
+        gram, cross, rss = self.gram, self.cross, self.total
+        if columns.size:
+            scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 1e-300))
+            normal = gram[np.ix_(columns, columns)] / scale / scale[:, None]
+            normal[np.diag_indices_from(normal)] += RIDGE
+            rows = gram[columns] / scale[:, None]
+            solved = np.linalg.solve(normal, np.c_[rows, cross[columns] / scale])
+            gram = gram - rows.T @ solved[:, :-1]
+            cross = cross - rows.T @ solved[:, -1]
+            rss, _ = self.solve(chosen)
+        aliased = np.diagonal(gram) <= ALIASED * np.diagonal(self.gram)
+        held = set(self._held(chosen))
+        result = np.zeros(len(self.groups))
+        gram = np.where(aliased[:, None] | aliased[None], 0.0, gram)
+        cross = np.where(aliased, 0.0, cross)
+        for batch in self._batches:
+            blocks = gram[batch.columns[:, :, None], batch.columns[:, None, :]]
+            own, _ = explained(blocks, cross[batch.columns][..., None], batch.positive)
+            left = np.maximum(rss - own[:, 0], SMALLEST_RSS * self.total)
+            result[batch.places] = self.count * np.log(rss / left)
+        for i, group in enumerate(self.groups):
+            if group.effect in held:
+                result[i] = 0.0
+        return result
+
+    def _held(self, chosen: Sequence[Group]) -> list[str]:
+        """Effects of a set, with all that they contain."""
+        held = [group.effect for group in chosen]
+        return held + [name for own in held for name in self.contains.get(own, ())]
+
+    def select(self, most: int, begin: Sequence[Group] = ()) -> list[Group]:
+        """Select effects forward and backward by (2).
+
+        Args:
+            most: maximum number of effects.
+            begin: the set with which to begin.
+        """
+        chosen = list(begin)
+        while len(chosen) < most:
+            gains = self.gains(chosen)
+            prices = np.array([self.price(group) for group in self.groups])
+            best = int(np.argmax(gains - prices))
+            if gains[best] <= prices[best]:
+                break
+            larger = [*chosen, self.groups[best]]
+            if not self.generalises(chosen, larger):
+                break
+            larger = self.pruned(larger)
+            if self.groups[best] not in larger:
+                break
+            chosen = larger
+        return chosen
+
+    def generalises(self, smaller: Sequence[Group], larger: Sequence[Group]) -> bool:
+        """Whether a larger set predicts runs better that its coefficients were not fitted to.
+
+        Each run is left out in turn (M. Stone, J. R. Stat. Soc. B 36(2), 111, 1974).
+        """
+        if len(self.totals) < 2:
+            return True
+        before, after = self._left_out(smaller), self._left_out(larger)
+        return bool(after.sum() < before.sum() and (after < before).mean() >= MAJORITY)
+
+    def _left_out(self, chosen: Sequence[Group]) -> Array:
+        """Return the residual sums of squares (R,) of each run, fitted to the others."""
+        found = []
+        groups = [*chosen, self._nuisance]
+        columns = np.array([c for group in groups for c in group.columns], dtype=np.intp)
+        for run, total in enumerate(self.totals):
+            gram, cross = self.gram - self.grams[run], self.cross - self.crosses[run]
+            _, parts = self._solve(groups, gram, cross)
+            own = np.concatenate(parts) if parts else np.zeros(0)
+            block = self.grams[run][np.ix_(columns, columns)]
+            found.append(total - 2.0 * own @ self.crosses[run][columns] + own @ block @ own)
+        return np.array(found)
+
+    def pruned(self, chosen: Sequence[Group]) -> list[Group]:
+        """Remove effects that do not pay by (2), the least useful first."""
+        left = list(chosen)
+        while left:
+            rss, _ = self.solve(left)
+            losses = []
+            for group in left:
+                rest = [other for other in left if other is not group]
+                without = self.solve(rest)[0]
+                losses.append(self.log_ratio(without, rss) - self.price(group))
+            least = int(np.argmin(losses))
+            if losses[least] > 0:
+                break
+            del left[least]
+        return left
+
+
+def groups_of(probes: Sequence[Probe]) -> list[Group]:
+    """Return the columns of probes that act together."""
+    places: dict[tuple[str, int], list[int]] = {}
+    for i, probe in enumerate(probes):
+        places.setdefault((probe.effect, probe.group), []).append(i)
+    return [
+        Group(effect, tuple(columns), tuple(not probes[i].signed for i in columns))
+        for (effect, _), columns in places.items()
+    ]

@@ -1,0 +1,338 @@
+"""Kalman filter and smoother about a measured motion, with process noise by maximum likelihood.
+
+All runs are filtered side by side. With δ the deviation of the state from the motion about which
+the model is linear (`sims.robot.measured`, eqs. (3) and (4)), and r[i] = y[i] - h(x̄[i]),
+
+    δ-[i+1] = A_i δ[i] - d_i,        P-[i+1] = A_i P[i] A_iᵀ + G_i Q G_iᵀ                      (1)
+    e[i] = r[i] - H_i δ-[i],         S_i = H_i P- H_iᵀ + R,     K_i = P- H_iᵀ S_i⁻¹            (2)
+    δ[i] = δ- + K_i e[i],            P[i] = P- - K_i S_i K_iᵀ                                  (3)
+    log L = - Σ_i (log det S_i + e_iᵀ S_i⁻¹ e_i) / 2                                           (4)
+
+(R. E. Kalman 1960, doi:10.1115/1.3662552; F. C. Schweppe 1965, doi:10.1109/TIT.1965.1053737). The
+smoother is that of Bryson and Frazier in its modified form (G. J. Bierman, Automatica 9, 503, 1973,
+doi:10.1016/0005-1098(73)90076-9): backward, with C_i = I - K_i H_i,
+
+    λ_i = C_iᵀ A_iᵀ λ_{i+1} - H_iᵀ S_i⁻¹ e_i,   Λ_i = C_iᵀ A_iᵀ Λ_{i+1} A_i C_i + H_iᵀ S_i⁻¹ H_i  (5)
+    δ[i|T] = δ-[i] - P-[i] λ_i,                 f[i|T] = - Q G_iᵀ λ_{i+1}                        (6)
+
+The likelihood is stationary in the variance q_j of the force that is missing at coordinate j where
+Σ_i (G_iᵀ λ_{i+1})_j² = Σ_i (G_iᵀ Λ_{i+1} G_i)_jj (S. J. Koopman, N. Shephard, J. R. Stat. Soc. B
+54(1), 135, 1992), which the iteration
+
+    q_j ← q_j Σ_i (G_iᵀ λ_{i+1})_j² / Σ_i (G_iᵀ Λ_{i+1} G_i)_jj                                  (7)
+
+solves. Sensor noise is white, or AR(1): then it is a state of its own (A. C. Harvey, Forecasting,
+Structural Time Series Models and the Kalman Filter, 1989, section 3.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.gap.model.noise import Noise
+from sims.base import Array
+from sims.robot.measured import IntervalMaps
+
+Mask = NDArray[np.bool_]
+Places = NDArray[np.intp]
+
+AR_FLOOR = 1e-3
+"""White part of AR(1) noise, as a share of its variance, so that no reading is exact."""
+LARGEST_CHANGE = 10.0
+"""Largest factor by which an iteration of (7) changes a variance."""
+ITERATIONS = 12
+"""Maximum number of iterations of (7)."""
+CONVERGED = 0.15
+"""Relative change of every standard deviation below which (7) ends."""
+SMALLEST_FORCE = 1e-6
+"""Smallest standard deviation of a missing force, as a share of the typical force."""
+
+
+@dataclass(frozen=True)
+class LinearRuns:
+    """The linear models of R runs, padded to T samples.
+
+    Attributes:
+        states: A (R, T - 1, Z, Z).
+        defects: d (R, T - 1, Z).
+        forces: G (R, T - 1, Z, E).
+        inputs: (R, T - 1, Z, E + nu) the same of forces and controls.
+        readings: H (R, T, C, Z).
+        residuals: r (R, T, C), zero where nothing was recorded.
+        recorded: (R, T, C) where a sample was recorded.
+        prior: (Z,) standard deviations of the first states.
+        step_errors: (R, T - 1, Z) what the steps of the integrator miss.
+    """
+
+    states: Array
+    defects: Array
+    forces: Array
+    inputs: Array
+    readings: Array
+    residuals: Array
+    recorded: Mask
+    prior: Array
+    step_errors: Array
+
+    def subset(self, chosen: Places) -> LinearRuns:
+        """Return some of the runs."""
+        return LinearRuns(
+            self.states[chosen],
+            self.defects[chosen],
+            self.forces[chosen],
+            self.inputs[chosen],
+            self.readings[chosen],
+            self.residuals[chosen],
+            self.recorded[chosen],
+            self.prior,
+            self.step_errors[chosen],
+        )
+
+    @classmethod
+    def stacked(
+        cls, maps: Sequence[IntervalMaps], observed: Array, prior: Array
+    ) -> LinearRuns:
+        """Stack the linear models of runs.
+
+        Args:
+            maps: of each run.
+            observed: (R, T, C), NaN where nothing was recorded.
+            prior: (Z,) standard deviations of the first states.
+        """
+        runs, samples, channels = observed.shape
+        size, forces = maps[0].forces.shape[1:]
+        states = np.tile(np.eye(size), (runs, samples - 1, 1, 1))
+        defects = np.zeros((runs, samples - 1, size))
+        by_force = np.zeros((runs, samples - 1, size, forces))
+        inputs = np.zeros((runs, samples - 1, *maps[0].inputs.shape[1:]))
+        readings = np.zeros((runs, samples, channels, size))
+        residuals = np.zeros(observed.shape)
+        errors = np.zeros((runs, samples - 1, size))
+        for run, own in enumerate(maps):
+            count = len(own.predicted)
+            states[run, : count - 1] = own.states
+            defects[run, : count - 1] = own.defects
+            by_force[run, : count - 1] = own.forces
+            inputs[run, : count - 1] = own.inputs
+            readings[run, :count] = own.readings
+            errors[run, : count - 1] = own.step_errors
+            residuals[run, :count] = observed[run, :count] - own.predicted
+        recorded = np.isfinite(residuals) & np.isfinite(observed)
+        residuals[~recorded] = 0.0
+        readings[~recorded] = 0.0
+        return cls(
+            states, defects, by_force, inputs, readings, residuals, recorded, prior, errors
+        )
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What the filter gives; B runs.
+
+    Attributes:
+        predicted: δ- (B, T, Z).
+        covariances: P- (B, T, Z, Z).
+        innovations: e (B, T, C), zero where nothing was recorded.
+        gains: K (B, T, Z, C).
+        whiteners: W (B, T, C, C) with Wᵀ W = S⁻¹.
+        log_likelihood: (B,).
+    """
+
+    predicted: Array
+    covariances: Array
+    innovations: Array
+    gains: Array
+    whiteners: Array
+    log_likelihood: Array
+
+    def subset(self, chosen: Places) -> Filtered:
+        """Return some of the runs."""
+        return Filtered(
+            self.predicted[chosen],
+            self.covariances[chosen],
+            self.innovations[chosen],
+            self.gains[chosen],
+            self.whiteners[chosen],
+            self.log_likelihood[chosen],
+        )
+
+    @property
+    def whitened(self) -> Array:
+        """W e (B, T, C): white with unit variance if the model is right."""
+        return np.einsum("btcd,btd->btc", self.whiteners, self.innovations)
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """What the smoother gives.
+
+    Attributes:
+        states: δ (B, T, Z).
+        forces: f (B, T - 1, E).
+        score: (E,) the right side of (7), by which variances change.
+    """
+
+    states: Array
+    forces: Array
+    score: Array
+
+
+def with_coloured_noise(runs: LinearRuns, noise: Noise) -> tuple[LinearRuns, Array]:
+    """Add states for AR(1) noise.
+
+    Args:
+        runs: the linear models.
+        noise: standard deviation and correlation of each channel.
+
+    Returns:
+        The models with one more state for each channel with correlated noise; and R (C,), the
+        variances of what remains white.
+    """
+    coloured = np.flatnonzero(noise.phi > 0)
+    white = np.square(noise.sigma)
+    if not coloured.size:
+        return runs, white
+    white = white.copy()
+    white[coloured] *= AR_FLOOR
+    (number, samples, channels), size = runs.residuals.shape, runs.prior.size
+    more = coloured.size
+    states = np.zeros((number, samples - 1, size + more, size + more))
+    states[:, :, :size, :size] = runs.states
+    own = size + np.arange(more)
+    states[:, :, own, own] = noise.phi[coloured]
+    defects = np.concatenate([runs.defects, np.zeros((number, samples - 1, more))], axis=2)
+    # The innovations of the noise are driven like forces, of known variance.
+    forces = np.zeros((number, samples - 1, size + more, runs.forces.shape[3] + more))
+    forces[:, :, :size, : runs.forces.shape[3]] = runs.forces
+    sizes = noise.sigma[coloured] * np.sqrt(1.0 - np.square(noise.phi[coloured]))
+    forces[:, :, own, runs.forces.shape[3] + np.arange(more)] = sizes
+    readings = np.concatenate(
+        [runs.readings, np.zeros((number, samples, channels, more))], axis=3
+    )
+    readings[:, :, coloured, own] = 1.0
+    readings[~runs.recorded] = 0.0
+    prior = np.concatenate([runs.prior, noise.sigma[coloured]])
+    found = replace(
+        runs, states=states, defects=defects, forces=forces, readings=readings, prior=prior
+    )
+    return found, white
+
+
+def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
+    """Filter all runs by (1) to (4).
+
+    Args:
+        runs: the linear models.
+        force: (E,) standard deviations of the missing forces, or (B, E) of each run; further
+            columns of G, those of coloured noise, have 1.
+        white: R (C,) variances of white noise.
+    """
+    number, samples, channels = runs.residuals.shape
+    size = runs.prior.size
+    scaled = runs.forces * _completed(force, runs)[..., None, None, :]
+    excited = scaled @ scaled.transpose(0, 1, 3, 2)
+    # What is not recorded has a reading of zero with the variance of one.
+    variances = np.where(runs.recorded, white, 1.0)
+    noise = np.zeros((number, samples, channels, channels))
+    diagonal = np.arange(channels)
+    noise[:, :, diagonal, diagonal] = variances
+    x = np.zeros((number, size))
+    p = np.tile(np.diag(np.square(runs.prior)), (number, 1, 1))
+    predicted = np.zeros((number, samples, size))
+    covariances = np.zeros((number, samples, size, size))
+    innovations = np.zeros((number, samples, channels))
+    gains = np.zeros((number, samples, size, channels))
+    whiteners = np.zeros((number, samples, channels, channels))
+    likelihood = np.zeros(number)
+    identity = np.eye(channels)
+    for i in range(samples):
+        h = runs.readings[:, i]
+        predicted[:, i], covariances[:, i] = x, p
+        crossed = p @ h.transpose(0, 2, 1)
+        root = np.linalg.cholesky(h @ crossed + noise[:, i])
+        whitener = np.linalg.solve(root, np.broadcast_to(identity, root.shape))
+        half = crossed @ whitener.transpose(0, 2, 1)
+        gain = half @ whitener
+        e = runs.residuals[:, i] - (h @ x[:, :, None])[:, :, 0]
+        w = (whitener @ e[:, :, None])[:, :, 0]
+        likelihood -= np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        likelihood -= 0.5 * np.square(w).sum(axis=1)
+        innovations[:, i], gains[:, i], whiteners[:, i] = e, gain, whitener
+        if i + 1 == samples:
+            break
+        x = x + (half @ w[:, :, None])[:, :, 0]
+        p = p - half @ half.transpose(0, 2, 1)
+        a = runs.states[:, i]
+        x = (a @ x[:, :, None])[:, :, 0] - runs.defects[:, i]
+        p = a @ p @ a.transpose(0, 2, 1) + excited[:, i]
+    return Filtered(predicted, covariances, innovations, gains, whiteners, likelihood)
+
+
+def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
+    """Smooth all runs by (5) and (6); arguments as those of `filter_runs`."""
+    number, samples, _ = runs.residuals.shape
+    size = runs.prior.size
+    sizes = _completed(force, runs)
+    states = np.zeros((number, samples, size))
+    count = runs.forces.shape[3]
+    forces = np.zeros((number, samples - 1, count))
+    adjoint = np.zeros((number, size))
+    information = np.zeros((number, size, size))
+    measured = np.zeros(count)
+    expected = np.zeros(count)
+    identity = np.eye(size)
+    for i in range(samples - 1, -1, -1):
+        h, w = runs.readings[:, i], filtered.whiteners[:, i]
+        weighed = w @ h
+        closed = identity - filtered.gains[:, i] @ h
+        if i + 1 < samples:
+            back = runs.states[:, i] @ closed
+            adjoint = (back.transpose(0, 2, 1) @ adjoint[:, :, None])[:, :, 0]
+            information = back.transpose(0, 2, 1) @ information @ back
+        white = (w @ filtered.innovations[:, i][:, :, None])[:, :, 0]
+        adjoint = adjoint - (weighed.transpose(0, 2, 1) @ white[:, :, None])[:, :, 0]
+        information = information + weighed.transpose(0, 2, 1) @ weighed
+        moved = (filtered.covariances[:, i] @ adjoint[:, :, None])[:, :, 0]
+        states[:, i] = filtered.predicted[:, i] - moved  # (6)
+        if i:
+            g = runs.forces[:, i - 1]
+            pushed = (g.transpose(0, 2, 1) @ adjoint[:, :, None])[:, :, 0]
+            forces[:, i - 1] = -np.square(sizes) * pushed
+            measured += np.square(pushed).sum(axis=0)
+            expected += np.einsum("rze,rzy,rye->e", g, information, g)
+    score = measured / np.maximum(expected, 1e-300)
+    return Smoothed(states, forces, score)
+
+
+def fit_process_noise(
+    runs: LinearRuns, force: Array, white: Array, typical: Array
+) -> tuple[Array, Filtered, Smoothed]:
+    """Fit the standard deviations of the missing forces by maximum likelihood, (7).
+
+    Args:
+        runs: the linear models.
+        force: (E,) where to begin.
+        white: R (C,).
+        typical: (E,) typical forces, which set the smallest deviations.
+    """
+    count = force.size
+    for _ in range(ITERATIONS):
+        filtered = filter_runs(runs, force, white)
+        smoothed = smooth_runs(runs, filtered, force)
+        ratio = np.clip(np.sqrt(smoothed.score[:count]), 1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
+        changed = np.maximum(force * ratio, SMALLEST_FORCE * typical)
+        done = bool((np.abs(changed / force - 1.0) < CONVERGED).all())
+        if done:
+            break
+        force = changed
+    return force, filtered, smoothed
+
+
+def _completed(force: Array, runs: LinearRuns) -> Array:
+    """Return the deviations of all columns of G, those of coloured noise included."""
+    more = runs.forces.shape[3] - force.shape[-1]
+    return np.concatenate([force, np.ones((*force.shape[:-1], more))], axis=-1)

@@ -1,0 +1,358 @@
+"""Linearisation of a robot's model about a measured motion, from sample to sample.
+
+`sims.robot.linear` linearises about a simulated motion, which may be far from the data. Here the
+motion is a given one, such as a smoothed measurement, with x̄[t] the state at step t. The model's
+step F misses it by the defect
+
+    d[t] = x̄[t+1] - F(x̄[t], u[t])                                                            (1)
+
+so that a deviation δ = x - x̄ of the true state follows, to first order,
+
+    δ[t+1] = A[t] δ[t] - d[t] + B[t] (f[t] + Σ_k c_k φ_k[t])                                   (2)
+
+with f a generalised force that the model lacks, and φ_k the force of a candidate effect k with
+coefficient c_k. Composed over the steps between two samples i and i + 1,
+
+    δ[i+1] = A_i δ[i] - d_i + G_i f_i + Σ_k c_k b_ik                                           (3)
+    y[i] = h(x̄[i]) + H_i δ[i] + Σ_k c_k ψ_ik                                                   (4)
+
+where f_i is held between samples and ψ is what an effect changes about a reading directly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from sims.base import Array, Scenario
+from sims.robot.floating import Afloat
+from sims.robot.forces import LOADED
+from sims.robot.instants import HELD, SIDES, Instants, Motion
+from sims.robot.linear import Added, Linear
+from sims.robot.midway import Places, ends
+from sims.robot.quiet import quiet
+from sims.robot.series import is_series
+from sims.robot.tangent import Change
+from sims.simulated import Simulated
+from sims.system import Acting, Input, Sensor
+
+BLOCK = 64
+"""Number of candidates whose responses are computed together."""
+LONGEST_HELD = 0.02
+"""Maximum number of seconds over which a Jacobian holds."""
+SMALL = 1e-4
+"""Size of the state difference from which the derivatives of readings are taken."""
+
+
+class Trajectory(NamedTuple):
+    """States of one run at the beginnings of all steps and at the end.
+
+    Attributes:
+        x, v: (S + 1, D) positions and velocities of the joints.
+        afloat: (S + 1, P) poses and (S + 1, F) velocities of floating joints.
+    """
+
+    x: Array
+    v: Array
+    afloat: Afloat
+
+
+@dataclass(frozen=True)
+class IntervalMaps:
+    """The linear model (3) and (4) of one run with T samples, Z states, E forces, C channels.
+
+    Attributes:
+        states: A (T - 1, Z, Z).
+        defects: d (T - 1, Z).
+        forces: G (T - 1, Z, E).
+        inputs: (T - 1, Z, E + nu) the same of forces and controls.
+        readings: H (T, C, Z).
+        predicted: h(x̄) (T, C).
+        step_errors: (T - 1, Z) what the steps of the integrator miss.
+    """
+
+    states: Array
+    defects: Array
+    forces: Array
+    inputs: Array
+    readings: Array
+    predicted: Array
+    step_errors: Array
+
+
+class MeasuredLinear(Linear):
+    """The linear model of one run about a given motion.
+
+    Args:
+        simulator: the robot's simulator.
+        theta: (dim,) its parameters.
+        scenario: the run.
+        start: (D,) positions and velocities at which the simulated motion begins.
+        trajectory: the motion.
+        measured: in its place, (T, 3) position, velocity and acceleration at the samples of joints,
+            by their numbers; all others move as they are simulated.
+        nearby: the linear model of a motion nearby, whose Jacobians are used again.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulated,
+        theta: Array,
+        scenario: Scenario,
+        start: tuple[Array, Array],
+        trajectory: Trajectory | None = None,
+        measured: Mapping[int, Array] | None = None,
+        nearby: MeasuredLinear | None = None,
+    ) -> None:
+        self._given, self._measured = trajectory, measured or {}
+        if nearby is not None:
+            self.quotients = nearby._tangent.quotients
+        spacing = float(np.median(np.diff(scenario.times))) if scenario.times.size > 1 else 0.0
+        self.held = float(np.clip(spacing, HELD, LONGEST_HELD))
+        super().__init__(simulator, theta, scenario, *start)
+        if self._names:
+            # Readings of the given motion, not of the simulated one.
+            with np.errstate(all="ignore"), quiet():
+                read = self._tangent.motion_readings
+            self._readings = {name: read[:, i] for i, name in enumerate(self._names)}
+        nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.size))
+        unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
+        with np.errstate(all="ignore"), quiet():
+            self.observed = self._seen(nothing, unread, [()])[0]
+        knots = np.rint(self._times / self._simulator.step).astype(np.intp)
+        self.knots: Places = np.clip(knots, 0, self._steps)
+
+    @property
+    def step_count(self) -> int:
+        """Number of steps, one more than the run takes."""
+        return self._steps + 1
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The motion about which the model is linearised."""
+        return Trajectory(self._motion.x, self._motion.v, self._motion.afloat)
+
+    def _nominal(self) -> Motion:
+        motion = super()._nominal()
+        given = self._given or self._from_samples(motion)
+        # Joints in series are not measured: they keep the simulated motion.
+        own = given.x.shape[1]
+        x, v = motion.x.copy(), motion.v.copy()
+        x[:, :own], v[:, :own] = given.x, given.v
+        return self._with_loads(replace(motion, x=x, v=v, afloat=given.afloat))
+
+    def _from_samples(self, motion: Motion) -> Trajectory:
+        """Interpolate the measured joints between samples by quintic Hermite polynomials."""
+        x, v = motion.x.copy(), motion.v.copy()
+        steps = self._simulator.step * np.arange(len(x))
+        for joint, samples in self._measured.items():
+            x[:, joint], v[:, joint] = quintic(self._times, samples, steps)
+        own = len(self._simulator.addresses.positions)
+        return Trajectory(x[:, :own], v[:, :own], motion.afloat)
+
+    def _with_loads(self, motion: Motion) -> Motion:
+        """Return the motion with the loads that transmissions carry in it."""
+        effects = [e for e in self._simulator.effects for e in (getattr(e, "members", ()) or (e,))]
+        if not any((e.of or e.name) in LOADED for e in effects):
+            return motion
+        simulator = self._simulator
+        bench = simulator.wide(self._work.acting)
+        outputs = [(name, int(c)) for name in SIDES for c in bench.whole.velocities]
+        acting = self._work.acting
+        at = Instants(bench, simulator.robotic, motion, acting, outputs, bench.whole)
+        _, loads = at.accelerated(acting)
+        size = motion.x.shape[1]
+        carried = np.stack([loads[at.of, :size], loads[at.of, size:]])
+        return replace(motion, carried=carried)
+
+    # -- the model from sample to sample
+
+    def interval_maps(self) -> IntervalMaps:
+        """Compose the steps between samples into the maps of (3) and (4)."""
+        tangent, size = self._tangent, self._tangent.size
+        forces = tangent.quotients.forces.shape[2]
+        intervals = self.knots.size - 1
+        with np.errstate(all="ignore"), quiet():
+            defects = self._tangent.defects
+        states = np.tile(np.eye(size), (intervals, 1, 1))
+        defect = np.zeros((intervals, size))
+        force = np.zeros((intervals, size, forces))
+        missed = np.zeros((intervals, size))
+        errors = self._step_errors()
+        of, quotients = tangent.looked_at, tangent.quotients
+        for steps, active in self._within():
+            a = quotients.states[of[steps]]
+            states[active] = a @ states[active]
+            defect[active] = np.einsum("izy,iy->iz", a, defect[active]) + defects[steps]
+            force[active] = a @ force[active] + quotients.forces[of[steps]]
+            missed[active] = np.einsum("izy,iy->iz", a, missed[active]) + errors[of[steps]]
+        count = self._motion.x.shape[0]
+        moved = np.broadcast_to(SMALL * np.eye(size)[:, None, :], (size, count, size))
+        read = np.zeros((size, count, len(self._names)))
+        if self._names:
+            rows = of[np.minimum(np.arange(count), of.size - 1)]
+            read = SMALL * np.moveaxis(quotients.read_states[rows], 2, 0)
+        with np.errstate(all="ignore"), quiet():
+            seen = self._seen(moved, read, [()] * size)
+        readings = np.moveaxis((seen - self.observed) / SMALL, 0, 2)
+        return IntervalMaps(
+            states, defect, force, self._composed, readings, self.observed, missed
+        )
+
+    def _step_errors(self) -> Array:
+        """(N, Z) what a step misses; nothing for Runge-Kutta, which is of fourth order."""
+        simulator, tangent = self._simulator, self._tangent
+        if ends(simulator.wide(self._work.acting).model):
+            return np.zeros((tangent.looks_at, tangent.size))
+        with np.errstate(all="ignore"), quiet():
+            return tangent.step_errors(simulator.half_steps(self._work.acting))
+
+    def _within(self) -> list[tuple[Places, Places]]:
+        """The first step of every interval, then the second, …: step numbers, and which intervals
+        have one.
+        """
+        lengths = np.diff(self.knots)
+        result = []
+        for number in range(int(lengths.max(initial=0))):
+            active = np.flatnonzero(lengths > number)
+            result.append((self.knots[:-1][active] + number, active))
+        return result
+
+    def added(self, effects: Sequence[Added]) -> tuple[Array, Array]:
+        """Compute what candidate effects add to (3) and (4).
+
+        A force is taken for its mean over the interval between two samples.
+
+        Args:
+            effects: K effects with their coefficients; those in series with a joint add nothing.
+
+        Returns:
+            Mean forces and controls (T - 1, E + nu, K), of which `IntervalMaps.inputs` make b; and
+            ψ (T, C, K); both in single precision.
+        """
+        count, samples = len(effects), self.knots.size
+        quotients = self._tangent.quotients
+        inputs = quotients.forces.shape[2] + quotients.controls.shape[2]
+        means = np.zeros((samples - 1, inputs, count), dtype=np.float32)
+        readings = np.zeros((samples, self.observed.shape[1], count), dtype=np.float32)
+        driven = self._driven([(e, c) for e, c in effects])
+        for begin in range(0, count, BLOCK):
+            part = range(begin, min(begin + BLOCK, count))
+            changes: list[Change] = []
+            sensors: list[Acting] = []
+            for owner, number in enumerate(part):
+                effect, c = effects[number]
+                parts = effect.parts(c[:, None, None])
+                sensors.append(tuple((e, k) for e, k in parts if isinstance(e, Sensor)))
+                for one, k in parts:
+                    known = isinstance(one, (Sensor, Input)) or is_series(one)
+                    if not known and k.any():
+                        changes += self._changes(owner, one, k)
+                changes += [c._replace(owner=owner) for c in driven.get(number, ())]
+            own = slice(begin, part.stop)
+            with np.errstate(all="ignore"):
+                pushed, read = self._tangent.pushed(changes, len(part))
+                means[:, :, own] = self._means(pushed)
+                readings[:, :, own] = self._read_directly(read, sensors)
+        return means, readings
+
+    def _means(self, pushed: Array) -> Array:
+        """Return means (T - 1, E + nu, K) over the intervals of what is pushed (S, E + nu, K)."""
+        lengths = np.diff(self.knots)
+        some = np.flatnonzero(lengths)
+        result = np.zeros((lengths.size, *pushed.shape[1:]))
+        sums = np.add.reduceat(pushed[: self.knots[-1]], self.knots[:-1][some], axis=0)
+        result[some] = sums / lengths[some][:, None, None]
+        return result
+
+    @cached_property
+    def _composed(self) -> Array:
+        """(T - 1, Z, E + nu) what a force or control held over each interval adds to the state."""
+        tangent = self._tangent
+        of, quotients = tangent.looked_at, tangent.quotients
+        by = np.concatenate([quotients.forces, quotients.controls], axis=2)
+        result = np.zeros((self.knots.size - 1, *by.shape[1:]))
+        for steps, active in self._within():
+            looked = of[steps]
+            result[active] = quotients.states[looked] @ result[active] + by[looked]
+        return result
+
+    def _read_directly(self, read: Array, sensors: Sequence[Acting]) -> Array:
+        """Return ψ (T, C, K) from changes of readings (S, O, K) and from sensors' effects."""
+        result = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
+        some = [k for k, acting in enumerate(sensors) if acting or read[:, :, k].any()]
+        if some:
+            nothing = np.zeros((len(some), self._motion.x.shape[0], self._tangent.size))
+            own = [sensors[k] for k in some]
+            seen = self._seen(nothing, np.moveaxis(read[:, :, some], 2, 0), own)
+            result[:, :, some] = np.moveaxis(seen - self.observed, 0, 2)
+        return result
+
+    def propagated(self, begun: Array, forces: Array) -> Array:
+        """Return deviations (S + 1, Z) at all steps by (2), from those at samples.
+
+        Args:
+            begun: δ (T, Z) at the samples.
+            forces: f (T - 1, E) held between samples.
+        """
+        tangent = self._tangent
+        of, quotients = tangent.looked_at, tangent.quotients
+        with np.errstate(all="ignore"), quiet():
+            defects = tangent.defects
+        result = np.zeros((self._motion.x.shape[0], tangent.size))
+        now = begun[:-1].copy()
+        for steps, active in self._within():
+            result[steps] = now[active]
+            ahead = np.einsum("izy,iy->iz", quotients.states[of[steps]], now[active])
+            push = np.einsum("ize,ie->iz", quotients.forces[of[steps]], forces[active])
+            now[active] = ahead - defects[steps] + push
+        result[self.knots[-1] :] = begun[-1]
+        return result
+
+    def moved(self, deviations: Array) -> Trajectory:
+        """Return the motion moved by deviations (S + 1, Z) of states."""
+        own, motion = len(self._simulator.addresses.positions), self._motion
+        size, na = motion.x.shape[1], motion.act.shape[1]
+        floating = self._simulator.wide(self._work.acting).floating
+        first = 2 * size + na + len(self._tangent.remembering)
+        moves = motion.afloat.rate.shape[1]
+        pose = motion.afloat.pose
+        if moves:
+            pose = floating.displaced(pose, deviations[:, first : first + moves])
+        rate = motion.afloat.rate + deviations[:, first + moves : first + 2 * moves]
+        return Trajectory(
+            motion.x[:, :own] + deviations[:, :own],
+            motion.v[:, :own] + deviations[:, size : size + own],
+            Afloat(pose, rate),
+        )
+
+
+def quintic(times: Array, samples: Array, instants: Array) -> tuple[Array, Array]:
+    """Interpolate by quintic Hermite polynomials, and linearly beyond the last sample.
+
+    Args:
+        times: (T,) of the samples, ascending.
+        samples: (T, 3) values, first and second derivatives.
+        instants: (n,) at which to interpolate.
+
+    Returns:
+        Values and first derivatives (n,).
+    """
+    within = np.clip(instants, times[0], times[-1])
+    below = np.clip(np.searchsorted(times, within, side="right") - 1, 0, times.size - 2)
+    h = times[below + 1] - times[below]
+    s = (within - times[below]) / h
+    (x0, v0, a0), (x1, v1, a1) = samples[below].T, samples[below + 1].T
+    v0, a0, v1, a1 = h * v0, h * h * a0, h * v1, h * h * a1
+    # Coefficients of the polynomial in s that has these values at 0 and at 1.
+    c2 = 0.5 * a0
+    c3 = 10.0 * (x1 - x0) - 6.0 * v0 - 4.0 * v1 - 1.5 * a0 + 0.5 * a1
+    c4 = -15.0 * (x1 - x0) + 8.0 * v0 + 7.0 * v1 + 1.5 * a0 - a1
+    c5 = 6.0 * (x1 - x0) - 3.0 * (v0 + v1) - 0.5 * a0 + 0.5 * a1
+    value = x0 + s * (v0 + s * (c2 + s * (c3 + s * (c4 + s * c5))))
+    slope = (v0 + s * (2.0 * c2 + s * (3.0 * c3 + s * (4.0 * c4 + 5.0 * s * c5)))) / h
+    return value + (instants - within) * slope, slope
