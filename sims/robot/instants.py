@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -18,15 +17,15 @@ from sims.robot.floating import Afloat
 from sims.robot.forces import LOADED, exerted, is_in_drive, moment_of
 from sims.robot.lanes import Addresses, Bench
 from sims.robot.midway import Places
+from sims.robot.model import Robot
 from sims.robot.moment import RobotMoment
+from sims.robot.native import SOLIMP, stiff
 from sims.robot.remembered import advanced, along
 from sims.robot.system import RobotSystem
 from sims.system import Acting, Effect, Force, Friction, Hidden, State
 
 HELD = 0.004
 """Seconds over which what is found at an instant holds: a pose changes little within."""
-SLOW = 1e-3
-"""rad/s or m/s over which dry friction turns its sign along the motion."""
 SIDES = ("qfrc_actuator", "qfrc_bias")
 """What presses on a joint's transmission from either side, in MuJoCo's data."""
 
@@ -334,32 +333,27 @@ class Instants:
         return result
 
     def _friction_force(self, joint: int, limit: Array) -> Array:
-        """(S,) the force of dry friction of at most `limit` (S,) over each step.
+        """Return the force that dry friction of at most `limit` (S,) adds in each step, (S,).
 
-        With v the velocity at the beginning of a step and a the acceleration over it, the soft form
-        is MuJoCo's constraint for friction loss
-        (https://mujoco.readthedocs.io/en/stable/computation/index.html, "Friction loss"), which
-        asks for the acceleration -b v with b = 2 / (d_max timeconst), and has the impedance d at no
-        violation. A joint whose inertia is 1 / A then feels
+        It is that of MuJoCo's constraint for friction loss
+        (https://mujoco.readthedocs.io/en/stable/computation/index.html, "Friction loss"). The
+        constraint asks for the acceleration -b v with b = 2 / (d_max timeconst), and yields by
+        R = A (1 - d) / d, with d its impedance and A the inverse inertia of the joint. With v the
+        velocity at the beginning of a step, a the acceleration over it, and the acceleration A f
+        that f itself makes, the force is
 
-            f = -clip(d (a + b v) / A, -limit, limit)                                          (1)
+            f = -clip((a + b v + A f) / R, -limit, limit) = -clip(d (a + b v) / A, -limit, limit)
 
-        a being what it has without f. So f turns its sign about 1 / b before v does, which is 9.5
-        ms with MuJoCo's defaults.
+        So f changes its sign about 1 / b before v does: 9.5 ms with MuJoCo's defaults, and up to a
+        step in the stiff form.
         """
-        robot = self._bench.robot
-        if robot.friction_form == "stiff":
-            v = self.moment.v[:, joint]
-            result: Array = -limit * v / (np.abs(v) + SLOW)
-            return result
-        motion, dof = self.motion, int(self._places.velocities[joint])
-        steps = len(motion.controls)
-        v = motion.v[:steps, joint]
+        motion, robot = self.motion, self._bench.robot
+        dof, steps = int(self._places.velocities[joint]), len(motion.controls)
         a = np.diff(motion.v[:, joint])[:steps] / motion.step
-        damping, impedance = friction_damping(robot.compiled, dof, motion.step)
-        share = impedance / float(robot.compiled.dof_invweight0[dof])
-        result = -np.clip(share * (a + damping * v), -limit, limit)  # (1)
-        return result
+        b, d = friction_damping(robot, dof)
+        load = d * (a + b * motion.v[:steps, joint]) / float(robot.compiled.dof_invweight0[dof])
+        force: Array = -np.clip(load, -limit, limit)
+        return force
 
     def gone(self, effect: Effect, c: Array) -> State:
         """States (S + 1, 1) of an effect along the motion, where it has any."""
@@ -379,26 +373,30 @@ class Instants:
         return moment_of(self._system, t[:, None], x, v, inputs, motion.carried, self.stiff(steps))
 
 
-def friction_damping(model: Any, dof: int, step: float) -> tuple[float, float]:
-    """Return b (1/s) and d of MuJoCo's constraint for friction loss, as eq. (1) of
-    `Instants._friction_force` has them.
+def friction_damping(robot: Robot, dof: int) -> tuple[float, float]:
+    """Return the damping b (1/s) and the impedance d of MuJoCo's constraint for friction loss, in
+    the form in which effects add friction to the robot (`Instants._friction_force`).
 
     Args:
-        model: the compiled model; `solreffriction` and `solimpfriction` are read from it.
+        robot: with the time step and the integrator in use.
         dof: index of the joint's velocity.
-        step: time step in seconds, which limits how short a time constant may be.
     """
     import mujoco
 
-    timeconst, ratio = (float(value) for value in model.dof_solref[dof])
-    at_rest, largest, width = (float(value) for value in model.dof_solimp[dof, :3])
+    model = robot.compiled
+    solref, solimp = model.dof_solref[dof], model.dof_solimp[dof]
+    if robot.friction_form == "stiff":
+        solref, solimp = stiff(float(model.opt.timestep), int(model.opt.integrator)), SOLIMP
+    timeconst, ratio = (float(value) for value in solref)
+    limits = np.clip(solimp[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    (at_rest, largest), width = limits.tolist(), float(solimp[2])
     # Friction has no violation; where the impedance is constant, MuJoCo takes the mean.
-    impedance = at_rest if width > mujoco.mjMINVAL else 0.5 * (at_rest + largest)
+    d = at_rest if width > mujoco.mjMINVAL else 0.5 * (at_rest + largest)
     if timeconst <= 0:
-        return -ratio / largest, impedance
+        return -ratio / largest, d
     if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE):
-        timeconst = max(timeconst, 2.0 * step)
-    return 2.0 / (largest * timeconst), impedance
+        timeconst = max(timeconst, 2.0 * float(model.opt.timestep))
+    return 2.0 / (largest * timeconst), d
 
 
 def _looked_at(motion: Motion, every: int) -> tuple[Places, Places]:

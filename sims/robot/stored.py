@@ -69,9 +69,7 @@ class StoredRobot:
             remedy = "put that one back, or explain the recording anew"
             raise InputError(f"model file {self.path} is not the one that was fitted; {remedy}")
         numerics = Numerics(**{**own_numerics(robot)._asdict(), **self.numerics})
-        return robot_simulator(
-            robot.with_friction_form(self.friction_form), self.free, numerics
-        )
+        return robot_simulator(robot.with_friction_form(self.friction_form), self.free, numerics)
 
 
 def of(kind: type[RobotSimulator]) -> StoredRobot:
