@@ -46,6 +46,11 @@ from sims.extended import Extended
 from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 
+SOFT_FRICTION = (
+    "dry friction has MuJoCo's soft form (solreffriction and solimpfriction of the model file): "
+    "it fits better than stiff friction"
+)
+"""What the user is told where the form of dry friction changes."""
 LEAST = 2.0
 """Samples for each unknown without which nothing can be said."""
 SPARE = 4
@@ -269,8 +274,9 @@ class _Explainer:
         """Search again with MuJoCo's soft form of dry friction, where it fits better than stiff
         friction what was found; otherwise return what was found.
         """
-        best = max(search.models.values(), key=lambda model: model.merit)
-        model = finding.model if finding.model.names else best
+        model = finding.model
+        if not model.names and finding.verdict != "adequate":
+            model = max(search.models.values(), key=lambda model: model.merit)
         if self.faults or self.watch.left() or not has_dry_friction(self.fitting, model.names):
             return base, search, finding
         self.watch.stage("comparing the two forms of dry friction")
@@ -288,6 +294,7 @@ class _Explainer:
             soft_search.refit([soft.fit.start()], race=False)
             soft_finding = self._finding(soft_search)
             if soft_finding.model.merit > finding.model.merit:
+                self.say(SOFT_FRICTION)
                 return soft_base, soft_search, soft_finding
         self._return(*stiff)
         self.assessor = assessor

@@ -17,6 +17,9 @@ from bench.problem.seeds import rng_for
 from sims.simulated import Simulated
 from sims.system import Effect, Friction
 
+_HOLDS = ", and holds still what pulls less"
+"""What the sentence of Coulomb friction says that is not true of the soft form, which creeps."""
+
 
 def soft_kind(kind: type[Simulated]) -> type[Simulated]:
     """The simulator's class of a robot, with dry friction in MuJoCo's soft form."""
@@ -26,12 +29,15 @@ def soft_kind(kind: type[Simulated]) -> type[Simulated]:
 
 
 def has_dry_friction(world: World, names: Iterable[str]) -> bool:
-    """Whether these effects of a robot, or freed numbers of its file, change `frictionloss`."""
+    """Whether these effects of a robot, or freed numbers of its file, contain dry friction, so that
+    its form matters.
+    """
     robot: Any = world.kind
     if not robot.has_model:
         return False
     freed: list[type[Effect]] = list(robot.system.freed_effects)
-    effects = [*(type(world.effects[name]) for name in names), *freed]
+    plain = [_plain_friction(world, name) for name in names]
+    effects = [*(type(world.effects[name]) for name in plain), *freed]
     return any(_is_dry_friction(effect) for effect in effects)
 
 
@@ -45,17 +51,19 @@ def form_of(world: World, name: str) -> str | None:
 
 def with_solver_parameters(world: World, name: str, says: str) -> str:
     """Name the soft form in the sentence of an effect, before the place in brackets at its end:
-    ``...; MuJoCo's soft form: solreffriction 0.02 1 (at joint elbow)``.
+    ``..., in MuJoCo's soft form (solreffriction 0.02 1) (at joint elbow)``.
     """
     robot: Any = world.kind
     effect = type(world.effects[name])
     members = getattr(effect, "members", ()) or (effect,)
     joints = [joint for joint in robot.robot.joints if joint.single]
-    dofs = [joints[member.coordinate].velocity for member in members]
+    places = [member.coordinate for member in members if member.coordinate is not None]
+    dofs = [joints[place].velocity for place in places]
     parameters = {tuple(robot.robot.compiled.dof_solref[dof].tolist()) for dof in dofs}
     text = " or ".join(" ".join(f"{value:g}" for value in pair) for pair in sorted(parameters))
     sentence, bracket, place = says.partition(" (at ")
-    return f"{sentence}; MuJoCo's soft form: solreffriction {text}{bracket}{place}"
+    sentence = sentence.removesuffix(_HOLDS)
+    return f"{sentence}, in MuJoCo's soft form (solreffriction {text}){bracket}{place}"
 
 
 def refit_in(world: World, models: Models, model: Model) -> Model:
