@@ -26,8 +26,8 @@ class Cause:
         says: the effect in a sentence that a person understands.
         coefficients: its fitted numbers with their 95 % intervals, by name.
         p_value: chance of a gain like its own if it were not there.
-        form: ``soft`` of dry friction with the solver parameters of the robot's model file, or
-            MuJoCo's defaults; left out for stiff friction and for all other causes.
+        form: ``soft`` where dry friction has the solver parameters of the robot's model file, or
+            MuJoCo's defaults; left out where it is stiff, and of all other causes.
     """
 
     effect: str
