@@ -245,6 +245,7 @@ class Instants:
             carried = np.stack([bind(name)[:n, places.velocities] for name in SIDES])
         moment = moment_of(self._system, t, x, v, inputs, carried, self.stiff(n))
         self._exerted = np.zeros_like(x)
+        limits: dict[int, Array] = {}
         for k, (effect, c) in enumerate(self._asked):
             own = np.repeat(c, n, axis=1)
             if isinstance(effect, Hidden):
@@ -256,13 +257,15 @@ class Instants:
                 bind("qfrc_applied")[:n, places.velocities] += force
             elif isinstance(effect, Friction):
                 assert effect.coordinate is not None
-                limit = np.maximum(effect.limit(own, moment)[:, 0], 0.0)
-                self._bench.rub(n, int(places.velocities[effect.coordinate]), limit)
+                limit = effect.limit(own, moment)[:, 0]
+                limits[effect.coordinate] = limits.get(effect.coordinate, 0.0) + limit
             elif isinstance(effect, Force):
                 force = effect.force(own, moment)
                 bind("qfrc_applied")[:n, places.velocities] += force
                 if is_in_drive(effect):
                     self._exerted += force
+        for joint, limit in limits.items():
+            self._bench.rub(n, int(places.velocities[joint]), np.maximum(limit, 0.0))
 
     def stiff(self, count: int) -> Array:
         """(count, D) of the servos, at so many instants."""

@@ -194,6 +194,7 @@ class Bench:
             self.batch.set_const()
         if self.robot.series:
             press(self.fields, self.robot)
+        self._loaded_friction = self.fields["dof_frictionloss"].copy()
 
     @staticmethod
     def _derives(field: str) -> bool:
@@ -343,15 +344,14 @@ class Bench:
         return result
 
     def rub(self, n: int, dof: int, limit: Array) -> None:
-        """Add dry friction of at most `limit` (n,) to that of the file, in the first n lanes, at
-        the joint whose velocity has the index `dof`.
+        """Add dry friction of at most `limit` (n,) to what was loaded, in the first n lanes, at the
+        joint whose velocity has the index `dof`; what was added before is replaced.
         """
         loss = self.fields["dof_frictionloss"]
         changed = FIELDS["friction.coulomb"].fields
         if not self._changed.issuperset(changed):
             self._changed.update(changed)
-        # Written anew for every batch of instants: what is the lanes' own stands in the file.
-        loss[:n, dof] = self._stated["dof_frictionloss"][0, dof] + limit
+        loss[:n, dof] = self._loaded_friction[:n, dof] + limit
         write_friction_form(self.fields, self.robot, slice(n), dof)
 
     def _begun(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
