@@ -21,7 +21,7 @@ from bench.gap.causes.structure import probes, remains
 from bench.gap.design import Design, design
 from bench.gap.explanation import Explanation
 from bench.gap.freeze import frozen
-from bench.gap.friction_form import has_dry_friction, refit_in, soft_kind
+from bench.gap.friction_form import choose_friction_form, has_dry_friction, soft_kind
 from bench.gap.held_out import HeldOutRuns
 from bench.gap.model.base_fit import LAST_STEPS, Base, fit_base, without_step
 from bench.gap.model.crew import Crew
@@ -284,8 +284,8 @@ class _Explainer:
         assessor = self.assessor
         self._enter(soft_kind(self.kind))
         self.assessor = replace(self.assessor, before=assessor.before)
-        soft = refit_in(self.fitting, search, model)
-        if soft.likelihood.value - model.likelihood.value >= SWITCH:
+        soft = choose_friction_form(search, model, self.fitting, SWITCH)
+        if soft is not None:
             self.fitting.correction = None
             fitter = Fitter(self.fitting, self.noise, base.frozen)
             (fit,) = fitter.fit([base.fit.start()], LAST_STEPS)

@@ -66,21 +66,29 @@ def with_solver_parameters(world: World, name: str, says: str) -> str:
     return f"{sentence}, in MuJoCo's soft form (solreffriction {text}){bracket}{place}"
 
 
-def refit_in(world: World, models: Models, model: Model) -> Model:
-    """Fit a model again in a world whose robot has the other form of dry friction.
+def choose_friction_form(models: Models, model: Model, other: World, margin: float) -> Model | None:
+    """Fit a model again with the other form of dry friction, and return it where it is likelier.
 
     Effects with a state that contain dry friction, such as hysteresis, do not act through
     `frictionloss`. The dry friction that they contain takes their place, since the other form may
     be all that they imitate.
 
     Args:
-        world: the same runs, with a simulator of the other form.
-        models: of the present form; its noise and its frozen parameters hold.
-        model: one of them.
+        models: of the present form; their noise and frozen parameters hold.
+        model: one of them, which `has_dry_friction`.
+        other: a world of the same runs and parameters, with a simulator of the other form.
+        margin: by which twice the log likelihood has to be larger.
 
     Returns:
-        The model in the other form. Compare `likelihood.value`, twice the log likelihood.
+        The model in the other form; None where the present form stands.
     """
+    fitted = _refit_in(other, models, model)
+    gain = fitted.likelihood.value - model.likelihood.value
+    return fitted if gain >= margin else None
+
+
+def _refit_in(world: World, models: Models, model: Model) -> Model:
+    """Fit the effects of a model in a world of the other form."""
     theta = model.fit.theta.copy()
     names: list[str] = []
     for name in model.names:
@@ -90,7 +98,7 @@ def refit_in(world: World, models: Models, model: Model) -> Model:
             theta[world.places(plain)[0]] += theta[world.places(name)[0]]
             theta[world.places(name)] = 0.0
         names += [plain] if plain not in names else []
-    # What the models draw decides nothing here.
+    # The random numbers of these models decide nothing.
     others = Models(world, models.noise, models.frozen, rng_for("friction form"), models.stated)
     others.refit([Start(tuple(names), theta, model.fit.states)], race=False)
     fitted = others.models[frozenset(names)]
