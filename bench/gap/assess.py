@@ -12,6 +12,7 @@ from bench.gap.causes.alternatives import Evidence
 from bench.gap.causes.name import Finding
 from bench.gap.causes.score_test import tail
 from bench.gap.causes.search import Search
+from bench.gap.friction_form import form_of, with_solver_parameters
 from bench.gap.measure import Gain, gain, intervals
 from bench.gap.model.bounds import bound_of, coefficient_bounds
 from bench.gap.model.floor import Floor
@@ -141,7 +142,11 @@ class Assessor:
         coefficients = effect.on(world.simulator.system)
         places = range(*world.slots[evidence.effect].indices(len(world.parameters)))
         by_name = {c.name: numbers[i] for c, i in zip(coefficients, places, strict=True)}
-        return Cause(evidence.effect, evidence.alternatives, effect.says, by_name, evidence.p_value)
+        form = form_of(world, evidence.effect)
+        says = effect.says
+        if form is not None:
+            says = with_solver_parameters(world, evidence.effect, says)
+        return Cause(evidence.effect, evidence.alternatives, says, by_name, evidence.p_value, form)
 
     def _counted(self) -> list[int]:
         """Channels that share the unit of the one that sensor effects act on."""

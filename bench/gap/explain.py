@@ -21,9 +21,11 @@ from bench.gap.causes.structure import probes, remains
 from bench.gap.design import Design, design
 from bench.gap.explanation import Explanation
 from bench.gap.freeze import frozen
+from bench.gap.friction_form import choose_friction_form, has_dry_friction, soft_kind
 from bench.gap.held_out import HeldOutRuns
-from bench.gap.model.base_fit import Base, fit_base, without_step
+from bench.gap.model.base_fit import LAST_STEPS, Base, fit_base, without_step
 from bench.gap.model.crew import Crew
+from bench.gap.model.fit import Fitter
 from bench.gap.model.floor import Floor, noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.watch import STAGES, Watch
@@ -44,6 +46,11 @@ from sims.extended import Extended
 from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 
+SOFT_FRICTION = (
+    "dry friction has MuJoCo's soft form (solreffriction and solimpfriction of the model file): "
+    "it fits better than stiff friction"
+)
+"""What the user is told where the form of dry friction changes."""
 LEAST = 2.0
 """Samples for each unknown without which nothing can be said."""
 SPARE = 4
@@ -251,6 +258,7 @@ class _Explainer:
         rng = self._rng()
         search = self._search(base, rng)
         finding = self._finding(search)
+        base, search, finding = self._with_friction_form(base, search, finding)
         self.watch.stage("measuring the gain")
         verdict = self.assessor.verdict(search, finding, rng, self.started)
         verdict = replace(verdict, recording_faults=self.faults)
@@ -259,6 +267,38 @@ class _Explainer:
         self.found = search, finding
         story = Teller(self.assessor, search, base, finding, self.notes).story(verdict)
         return Explanation(verdict, story, self._extended(search, finding))
+
+    def _with_friction_form(
+        self, base: Base, search: Search, finding: Finding
+    ) -> tuple[Base, Search, Finding]:
+        """Search again with MuJoCo's soft form of dry friction, where it fits better than stiff
+        friction what was found; otherwise return what was found.
+        """
+        model = finding.model
+        if not model.names and finding.verdict != "adequate":
+            model = max(search.models.values(), key=lambda model: model.merit)
+        if self.faults or self.watch.left() or not has_dry_friction(self.fitting, model.names):
+            return base, search, finding
+        self.watch.stage("comparing the two forms of dry friction")
+        stiff = self.kind, self.fitting, self.measuring
+        assessor = self.assessor
+        self._enter(soft_kind(self.kind))
+        self.assessor = replace(self.assessor, before=assessor.before)
+        soft = choose_friction_form(search, model, self.fitting, SWITCH)
+        if soft is not None:
+            self.fitting.correction = None
+            fitter = Fitter(self.fitting, self.noise, base.frozen)
+            (fit,) = fitter.fit([base.fit.start()], LAST_STEPS)
+            soft_base = without_step(self.fitting, self.noise, replace(base, fit=fit))
+            soft_search = self._search(soft_base, self._rng())
+            soft_search.refit([soft.fit.start()], race=False)
+            soft_finding = self._finding(soft_search)
+            if soft_finding.model.merit > finding.model.merit:
+                self.say(SOFT_FRICTION)
+                return soft_base, soft_search, soft_finding
+        self._return(*stiff)
+        self.assessor = assessor
+        return base, search, finding
 
     def _finding(self, search: Search) -> Finding:
         """What the simulator lacks; no cause where the recording states a unit or a sign wrongly,

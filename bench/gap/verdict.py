@@ -26,6 +26,8 @@ class Cause:
         says: the effect in a sentence that a person understands.
         coefficients: its fitted numbers with their 95 % intervals, by name.
         p_value: chance of a gain like its own if it were not there.
+        form: ``soft`` where dry friction has the solver parameters of the robot's model file, or
+            MuJoCo's defaults; left out where it is stiff, and of all other causes.
     """
 
     effect: str
@@ -33,6 +35,7 @@ class Cause:
     says: str
     coefficients: Mapping[str, Number]
     p_value: float
+    form: str | None = None
 
     @property
     def open_numbers(self) -> dict[str, Number]:
@@ -51,6 +54,7 @@ class Cause:
             "says": self.says,
             "coefficients": _estimates(self.coefficients),
             "p_value": self.p_value,
+            **({"form": self.form} if self.form is not None else {}),
         }
 
     @classmethod
@@ -62,6 +66,7 @@ class Cause:
             document["says"],
             _numbers(document["coefficients"]),
             document["p_value"],
+            document.get("form"),
         )
 
     def __repr__(self) -> str:

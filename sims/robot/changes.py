@@ -46,6 +46,8 @@ KEPT = "as it was: it would move along with another change"
 
 KEYLESS = "keyframes are left out: they lack the coordinates of joints in series"
 
+COULOMB = "friction.coulomb"
+
 _NOTES = {
     "joint.flexibility": "joint.flexibility: the joint has a second one in series, whose position "
     "begins at zero in the file; damping is a share of the critical one",
@@ -53,10 +55,14 @@ _NOTES = {
     "middle of its gap in the file",
     "joint.coupling": "joint.coupling: the joint's actuator drives a tendon, the joint with 1 and "
     "the one before it with the coefficient",
-    "friction.coulomb": "friction.coulomb: dry friction is stiff in the file (solreffriction, "
+    COULOMB: "friction.coulomb: dry friction is stiff in the file (solreffriction, "
     "solimpfriction), or it would creep",
 }
 """What is to be known of effects that a file holds."""
+_SOFT = (
+    "friction.coulomb: dry friction has MuJoCo's soft form, since solreffriction and "
+    "solimpfriction are left as they were; a joint under load creeps"
+)
 
 
 @dataclass(frozen=True)
@@ -115,7 +121,7 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
             said.append(f"{cause.told(recording)}: not in the file: {answer}")
             continue
         held.append(cause)
-        note = f"{cause.effect}: {answer[1:]}" if answer else _NOTES.get(cause.effect)
+        note = f"{cause.effect}: {answer[1:]}" if answer else _note(robot, cause.effect)
         if note and note not in said:
             said.append(note)
         changed = [one.element for one in differing(robot.compiled, before, wanted, 0.0)]
@@ -134,6 +140,13 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
         robot = with_flanks(robot, series, model)
         spec, model = _compiled(robot, wanted)
     return Applied(robot, spec, model, wanted, comments, tuple(held), tuple(said))
+
+
+def _note(robot: Robot, effect: str) -> str | None:
+    """What is to be known of an effect that the file holds; None where there is nothing."""
+    if effect == COULOMB and robot.friction_form == "soft":
+        return _SOFT
+    return _NOTES.get(effect)
 
 
 def _is_in_series(cause: Cause) -> bool:

@@ -17,15 +17,15 @@ from sims.robot.floating import Afloat
 from sims.robot.forces import LOADED, exerted, is_in_drive, moment_of
 from sims.robot.lanes import Addresses, Bench
 from sims.robot.midway import Places
+from sims.robot.model import Robot
 from sims.robot.moment import RobotMoment
+from sims.robot.native import SOLIMP, stiff
 from sims.robot.remembered import advanced, along
 from sims.robot.system import RobotSystem
 from sims.system import Acting, Effect, Force, Friction, Hidden, State
 
 HELD = 0.004
 """Seconds over which what is found at an instant holds: a pose changes little within."""
-SLOW = 1e-3
-"""rad/s or m/s over which dry friction turns its sign along the motion."""
 SIDES = ("qfrc_actuator", "qfrc_bias")
 """What presses on a joint's transmission from either side, in MuJoCo's data."""
 
@@ -249,6 +249,7 @@ class Instants:
             carried = np.stack([bind(name)[:n, places.velocities] for name in SIDES])
         moment = moment_of(self._system, t, x, v, inputs, carried, self.stiff(n))
         self._exerted = np.zeros_like(x)
+        limits: dict[int, Array] = {}
         for k, (effect, c) in enumerate(self._asked):
             own = np.repeat(c, n, axis=1)
             if isinstance(effect, Hidden):
@@ -260,13 +261,15 @@ class Instants:
                 bind("qfrc_applied")[:n, places.velocities] += force
             elif isinstance(effect, Friction):
                 assert effect.coordinate is not None
-                limit = np.maximum(effect.limit(own, moment)[:, 0], 0.0)
-                self._bench.rub(n, int(places.velocities[effect.coordinate]), limit)
+                limit = effect.limit(own, moment)[:, 0]
+                limits[effect.coordinate] = limits.get(effect.coordinate, 0.0) + limit
             elif isinstance(effect, Force):
                 force = effect.force(own, moment)
                 bind("qfrc_applied")[:n, places.velocities] += force
                 if is_in_drive(effect):
                     self._exerted += force
+        for joint, limit in limits.items():
+            self._bench.rub(n, int(places.velocities[joint]), np.maximum(limit, 0.0))
 
     def stiff(self, count: int) -> Array:
         """(count, D) of the servos, at so many instants."""
@@ -342,10 +345,32 @@ class Instants:
         assert isinstance(effect, Friction)
         assert effect.coordinate is not None
         limit = effect.limit(own, self.moment)[:, 0]
-        v = self.moment.v[:, effect.coordinate]
         result = np.zeros_like(self.moment.x)
-        result[:, effect.coordinate] = -limit * v / (np.abs(v) + SLOW)
+        result[:, effect.coordinate] = self._friction_force(effect.coordinate, limit)
         return result
+
+    def _friction_force(self, joint: int, limit: Array) -> Array:
+        """Return the force that dry friction of at most `limit` (S,) adds in each step, (S,).
+
+        It is that of MuJoCo's constraint for friction loss
+        (https://mujoco.readthedocs.io/en/stable/computation/index.html, "Friction loss"). The
+        constraint asks for the acceleration -b v with b = 2 / (d_max timeconst), and yields by
+        R = A (1 - d) / d, with d its impedance and A the inverse inertia of the joint. With v the
+        velocity at the beginning of a step, a the acceleration over it, and the acceleration A f
+        that f itself makes, the force is
+
+            f = -clip((a + b v + A f) / R, -limit, limit) = -clip(d (a + b v) / A, -limit, limit)
+
+        So f changes its sign about 1 / b before v does: 9.5 ms with MuJoCo's defaults, and up to a
+        step in the stiff form.
+        """
+        motion, robot = self.motion, self._bench.robot
+        dof, steps = int(self._places.velocities[joint]), len(motion.controls)
+        a = np.diff(motion.v[:, joint])[:steps] / motion.step
+        b, d = friction_damping(robot, dof)
+        load = d * (a + b * motion.v[:steps, joint]) / float(robot.compiled.dof_invweight0[dof])
+        force: Array = -np.clip(load, -limit, limit)
+        return force
 
     def gone(self, effect: Effect, c: Array) -> State:
         """States (S + 1, 1) of an effect along the motion, where it has any."""
@@ -363,6 +388,32 @@ class Instants:
         x = 0.5 * (motion.x[:-1] + motion.x[1:])[:steps]
         v = 0.5 * (motion.v[:-1] + motion.v[1:])[:steps]
         return moment_of(self._system, t[:, None], x, v, inputs, motion.carried, self.stiff(steps))
+
+
+def friction_damping(robot: Robot, dof: int) -> tuple[float, float]:
+    """Return the damping b (1/s) and the impedance d of MuJoCo's constraint for friction loss, in
+    the form in which effects add friction to the robot (`Instants._friction_force`).
+
+    Args:
+        robot: with the time step and the integrator in use.
+        dof: index of the joint's velocity.
+    """
+    import mujoco
+
+    model = robot.compiled
+    solref, solimp = model.dof_solref[dof], model.dof_solimp[dof]
+    if robot.friction_form == "stiff":
+        solref, solimp = stiff(float(model.opt.timestep), int(model.opt.integrator)), SOLIMP
+    timeconst, ratio = (float(value) for value in solref)
+    limits = np.clip(solimp[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    (at_rest, largest), width = limits.tolist(), float(solimp[2])
+    # Friction has no violation; where the impedance is constant, MuJoCo takes the mean.
+    d = at_rest if width > mujoco.mjMINVAL else 0.5 * (at_rest + largest)
+    if timeconst <= 0:
+        return -ratio / largest, d
+    if not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_REFSAFE):
+        timeconst = max(timeconst, 2.0 * float(model.opt.timestep))
+    return 2.0 / (largest * timeconst), d
 
 
 def _looked_at(motion: Motion, every: int) -> tuple[Places, Places]:

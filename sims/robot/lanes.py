@@ -19,7 +19,7 @@ from sims.robot import contacts
 from sims.robot.floating import Afloat, Floating
 from sims.robot.midway import Look, Mask, Midway, Places
 from sims.robot.model import Robot
-from sims.robot.native import COUPLING, FIELDS, SOLIMP, lanes_spec, stiff_of
+from sims.robot.native import COUPLING, FIELDS, lanes_spec, write_friction_form
 from sims.robot.quiet import quiet
 from sims.robot.series import FIELDS as SERIES
 from sims.robot.series import WRITTEN, hung, is_series, press
@@ -194,6 +194,7 @@ class Bench:
             self.batch.set_const()
         if self.robot.series:
             press(self.fields, self.robot)
+        self._loaded_friction = self.fields["dof_frictionloss"].copy()
 
     @staticmethod
     def _derives(field: str) -> bool:
@@ -302,10 +303,9 @@ class Bench:
         own = loss[:n, dofs].copy()
         rubs = bool(asking.rubs.any())
         if rubs:
-            # Where none of them rubs, the friction of the file stays as stiff as the file says.
+            # Where no effect adds friction, that of the file keeps its solver parameters.
             lanes, joints = np.nonzero(asking.rubs)
-            self.fields["dof_solref"][lanes, dofs[joints]] = stiff_of(self.fields, self.robot)
-            self.fields["dof_solimp"][lanes, dofs[joints]] = SOLIMP
+            write_friction_form(self.fields, self.robot, lanes, dofs[joints])
             self._changed.update(FIELDS["friction.coulomb"].fields)
         result = self._begun(n, steps, record)
         shown = {name: bind(name)[:n] for name in record}
@@ -344,15 +344,15 @@ class Bench:
         return result
 
     def rub(self, n: int, dof: int, limit: Array) -> None:
-        """Let dry friction of at most `limit` (n,) besides act on the first n lanes of a joint."""
+        """Add dry friction of at most `limit` (n,) to what was loaded, in the first n lanes, at the
+        joint whose velocity has the index `dof`; what was added before is replaced.
+        """
         loss = self.fields["dof_frictionloss"]
         changed = FIELDS["friction.coulomb"].fields
         if not self._changed.issuperset(changed):
             self._changed.update(changed)
-        # Written anew for every batch of instants: what is the lanes' own stands in the file.
-        loss[:n, dof] = self._stated["dof_frictionloss"][0, dof] + limit
-        self.fields["dof_solref"][:n, dof] = stiff_of(self.fields, self.robot)
-        self.fields["dof_solimp"][:n, dof] = SOLIMP
+        loss[:n, dof] = self._loaded_friction[:n, dof] + limit
+        write_friction_form(self.fields, self.robot, slice(n), dof)
 
     def _begun(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
         """Arrays that will hold what is recorded."""

@@ -5,7 +5,7 @@ the compiled model.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
 from pathlib import Path
 from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
@@ -18,6 +18,12 @@ from sims.robot.quiet import quiet
 Format = Literal["mjcf", "urdf"]
 Kind = Literal["hinge", "slide", "ball", "free"]
 Drive = Literal["motor", "position", "velocity", "pid", "other"]
+FrictionForm = Literal["stiff", "soft"]
+"""How MuJoCo's solver holds the dry friction that effects add: ``stiff`` is Coulomb friction, as
+stiff as the integrator allows; ``soft`` leaves the solver parameters of the model file
+(`solreffriction`, `solimpfriction`, MuJoCo's defaults where the file states none).
+"""
+FRICTION_FORMS: tuple[FrictionForm, ...] = ("stiff", "soft")
 KINDS: tuple[Kind, ...] = ("free", "ball", "slide", "hinge")
 """In the order of MuJoCo's mjtJoint."""
 
@@ -131,6 +137,8 @@ class Robot:
         series: of joints that were put in series with others (`sims.robot.series`), by name, the
             inertia about them, kg or kg m^2; no other joint is in this model alone.
         coupled: joints whose drives turn the joint before as well (`sims.robot.coupled`).
+        friction_form: of dry friction that effects add to the file's; the friction that the file
+            states alone keeps the file's solver parameters.
         kept: what functions `kept_with_robot` found of it.
     """
 
@@ -146,6 +154,7 @@ class Robot:
     speeds: Mapping[str, float] = field(default_factory=dict)
     series: Mapping[str, float] = field(default_factory=dict)
     coupled: tuple[str, ...] = ()
+    friction_form: FrictionForm = "stiff"
     kept: dict[tuple[Any, ...], Any] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
@@ -153,6 +162,13 @@ class Robot:
         """The mujoco.MjModel; nobody writes into it."""
         with quiet():
             return self.spec.compile()
+
+    def with_friction_form(self, form: FrictionForm) -> Robot:
+        """The same robot, to which effects add dry friction in this form."""
+        other = replace(self, friction_form=form)
+        # The form is no part of the compiled model, so that it need not be compiled again.
+        other.__dict__["compiled"] = self.compiled
+        return other
 
     @property
     def name(self) -> str:

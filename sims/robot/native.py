@@ -22,7 +22,9 @@ from sims.base import Array
 from sims.robot.model import TENDON, Robot
 
 SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""Of dry friction: as hard as MuJoCo allows, everywhere; what is stuck then hardly creeps."""
+"""`solimp` of stiff dry friction: the hardest that MuJoCo allows, so that a joint at rest hardly
+creeps.
+"""
 SOFT = -1e-9
 """In place of a stiffness, which dry friction has none of: so that MuJoCo reads the second number
 as a damping.
@@ -92,6 +94,21 @@ def stiff_of(fields: Fields, robot: Robot) -> tuple[float, float]:
     return stiff(float(step), int(kind))
 
 
+def write_friction_form(fields: Fields, robot: Robot, lanes: Any, dofs: Any) -> None:
+    """Set the solver parameters of dry friction that effects add, in the form of the robot.
+
+    Args:
+        fields: model fields of the lanes, changed in place.
+        robot: its `friction_form` decides; ``soft`` leaves the parameters of the file.
+        lanes: index of the lanes.
+        dofs: index of the joints' velocities.
+    """
+    if robot.friction_form == "soft":
+        return
+    fields["dof_solref"][lanes, dofs] = stiff_of(fields, robot)
+    fields["dof_solimp"][lanes, dofs] = SOLIMP
+
+
 def added(stated: Any, c: Any) -> Any:
     """(1); a number below zero that the file states may stay."""
     return np.maximum(stated + c, np.minimum(stated, 0.0))
@@ -124,8 +141,7 @@ def _add_friction(fields: Fields, robot: Robot, place: str, c: Array) -> None:
     # In the lanes where it acts alone: what is zero leaves the file as it is.
     rubs = c[0] != 0
     loss[:, column] = added(loss[:, column], c[0])
-    fields["dof_solref"][rubs, column] = stiff_of(fields, robot)
-    fields["dof_solimp"][rubs, column] = SOLIMP
+    write_friction_form(fields, robot, rubs, column)
 
 
 def _add_spring(fields: Fields, robot: Robot, place: str, c: Array) -> None:

@@ -76,6 +76,7 @@ def _robot(
     if kind == "urdf":
         notes += urdf.mended(files, root)
         spec = _parsed(files, root)
+        urdf.stiffen_mimics(spec)
     else:
         absent = mjcf.found(files, root)
         spec = _parsed(files, root)

@@ -26,7 +26,7 @@ from sims.robot.floating import Afloat, Floating
 from sims.robot.forces import Forces, over_time
 from sims.robot.lanes import LANES, Addresses, Bench
 from sims.robot.midway import Mask, Places
-from sims.robot.model import Robot
+from sims.robot.model import FrictionForm, Robot
 from sims.robot.numerics import INTEGRATORS, Numerics, RobotEngine, own_numerics
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
@@ -89,6 +89,16 @@ class RobotSimulator(Simulated):
         """The same robot, stepped in another way."""
         # The robot stays as its file states it, so that a result can say what is to change there.
         return robot_simulator(cls.robot, cls.free, numerics)
+
+    @classmethod
+    def with_friction_form(cls, form: FrictionForm) -> type[RobotSimulator]:
+        """The same robot, whose effects add dry friction in another form of MuJoCo's.
+
+        Args:
+            form: ``stiff`` for Coulomb friction; ``soft`` for the solver parameters of the model
+                file, or MuJoCo's defaults where the file states none.
+        """
+        return robot_simulator(cls.robot.with_friction_form(form), cls.free, cls.numerics)
 
     @classmethod
     def halved(cls) -> type[RobotSimulator]:
@@ -410,8 +420,9 @@ def robot_simulator(
         InputError: it has no joint that can be explained, or a name in `free` does not exist.
     """
     numerics = numerics or own_numerics(robot)
-    # Made at run time as it is, no text of a module tells it from another robot's.
+    # The class is made at run time: no source text distinguishes it from that of another robot.
     told = repr((robot.digest, tuple(free), tuple(numerics)))
+    told += "" if robot.friction_form == "stiff" else robot.friction_form
     system = system_of(robot, free)
     declared = {
         "system": system,

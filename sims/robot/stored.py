@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sims.base import InputError
+from sims.robot.model import FRICTION_FORMS, FrictionForm
 from sims.user_toml import Source, fault, finite, names, table, text
 
 if TYPE_CHECKING:
     from sims.robot.simulator import RobotSimulator
 
-KEYS = ("model", "digest", "free", "actuators", "engine", "numerics")
-"""What a file has of it."""
+KEYS = ("model", "digest", "free", "actuators", "engine", "numerics", "friction_form")
+"""Keys of extended.toml that describe the robot."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class StoredRobot:
         actuators: that a recording added, by name.
         engine: time step and integrator that it stated in place of the file's.
         numerics: ``timestep`` and ``integrator`` other than those, of what was found.
+        friction_form: form of the dry friction that effects add (`sims.robot.model.FrictionForm`).
     """
 
     path: Path
@@ -39,11 +41,15 @@ class StoredRobot:
     actuators: Mapping[str, Any] = field(default_factory=dict)
     engine: Mapping[str, Any] = field(default_factory=dict)
     numerics: Mapping[str, Any] = field(default_factory=dict)
+    friction_form: FrictionForm = "stiff"
 
     def document(self, folder: Path | None) -> dict[str, Any]:
         """As TOML in a file of this folder; the model file is named alone where there is none."""
         where = self.path.name if folder is None else _from(folder, self.path)
         document = {key: value for key, value in asdict(self).items() if value and key in KEYS}
+        # A file without the key means stiff friction, as files of earlier versions do.
+        if self.friction_form == "stiff":
+            del document["friction_form"]
         free = {"free": list(self.free)} if self.free else {}
         return {"model": where, **document, **free}
 
@@ -63,7 +69,7 @@ class StoredRobot:
             remedy = "put that one back, or explain the recording anew"
             raise InputError(f"model file {self.path} is not the one that was fitted; {remedy}")
         numerics = Numerics(**{**own_numerics(robot)._asdict(), **self.numerics})
-        return robot_simulator(robot, self.free, numerics)
+        return robot_simulator(robot.with_friction_form(self.friction_form), self.free, numerics)
 
 
 def of(kind: type[RobotSimulator]) -> StoredRobot:
@@ -79,6 +85,7 @@ def of(kind: type[RobotSimulator]) -> StoredRobot:
         robot.actuator_tables,
         robot.engine_table,
         kind.numerics._asdict() if differs else {},
+        robot.friction_form,
     )
 
 
@@ -112,7 +119,16 @@ def read_stored(source: Path, document: Mapping[str, Any]) -> StoredRobot:
         table(source, "actuators", document.get("actuators", {})),
         table(source, "engine", document.get("engine", {})),
         _numerics(source, document.get("numerics", {})),
+        _friction_form(source, document.get("friction_form", "stiff")),
     )
+
+
+def _friction_form(source: Source, value: Any) -> FrictionForm:
+    """Check the value of ``friction_form``."""
+    for form in FRICTION_FORMS:
+        if value == form:
+            return form
+    raise fault(source, "friction_form", " or ".join(FRICTION_FORMS), value)
 
 
 def _numerics(source: Source, value: Any) -> dict[str, Any]:

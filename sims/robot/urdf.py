@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 from sims.base import InputError, unknown
 from sims.limits import cut
 from sims.robot.links import inertials, mass, number, shapes
+from sims.robot.native import SOLIMP
 from sims.robot.quiet import one_line
 from sims.robot.words import listed
 from sims.robot.xmlfile import Files, children, written
@@ -21,6 +23,8 @@ SEEN = ("material", "visual")
 SINGLE = ("revolute", "continuous", "prismatic")
 MOVING = (*SINGLE, "floating", "planar", "spherical")
 KINDS = ("fixed", *MOVING)
+RIGID = (1e-4, 1.0)
+"""`solref` of a rigid relation: MuJoCo raises the time constant, in s, to two time steps."""
 
 
 def mended(files: Files, root: Element) -> list[str]:
@@ -216,6 +220,18 @@ def _limits(joints: Sequence[Element]) -> list[str]:
     return notes
 
 
+def stiffen_mimics(spec: Any) -> None:
+    """Let mimic joints follow as stiffly as MuJoCo allows: URDF states a rigid relation, and
+    MuJoCo's default equality follows it with a delay of 20 ms.
+
+    Args:
+        spec: mujoco.MjSpec of a URDF, whose only equalities are those of mimic joints.
+    """
+    for equality in spec.equalities:
+        equality.solref = RIGID
+        equality.solimp = SOLIMP
+
+
 def _mimics(joints: Sequence[Element]) -> list[str]:
     kinds = {joint.get("name"): joint.get("type") for joint in joints}
     tied, loose = [], []
@@ -230,7 +246,7 @@ def _mimics(joints: Sequence[Element]) -> list[str]:
                 loose.append(f"{name} ({other})")
     notes = []
     if tied:
-        notes.append(f"mimic joints follow by MuJoCo's soft equality: {listed(tied)}")
+        notes.append(f"mimic joints follow as stiffly as MuJoCo allows: {listed(tied)}")
     if loose:
         notes.append(f"mimics of joints that do not move, or are not there: {listed(loose)}")
     return notes

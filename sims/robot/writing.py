@@ -13,7 +13,7 @@ from typing import Any
 
 from sims.extended import Number
 from sims.robot.causes import one_by_one
-from sims.robot.changes import CLOSE, KEPT, ROUNDS, Applied, apply
+from sims.robot.changes import CLOSE, COULOMB, KEPT, ROUNDS, Applied, apply
 from sims.robot.coupled import before
 from sims.robot.document import Document
 from sims.robot.markup import UnfitError, heading, number, numbers
@@ -30,6 +30,11 @@ Causes = Mapping[str, Mapping[str, Number]]
 
 SAME = 1e-12
 """Relative difference of two numbers of a compiled model that is rounding."""
+
+_SOFT_IN_URDF = (
+    "friction.coulomb: a URDF cannot say that dry friction is stiff, and MuJoCo reads it in its "
+    "soft form; extended.xml holds the stiff form"
+)
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,9 @@ def _urdf(robot: Robot, causes: Causes, recording: str, said: list[str]) -> str 
         answer = writer.write(cause)
         if answer:
             lines.append(f"{cause.told(recording)}: not in the URDF: {answer}")
+        elif cause.effect == COULOMB and robot.friction_form == "stiff":
+            lines.append(_SOFT_IN_URDF)
+    lines = list(dict.fromkeys(lines))
     said += lines
     return writer.text(lines)
 

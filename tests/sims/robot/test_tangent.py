@@ -121,6 +121,26 @@ def test_what_hangs_on_the_drive_moves_with_the_servo(name):
     assert off < 0.02
 
 
+@pytest.mark.parametrize(
+    "frictions", [("friction.coulomb@elbow", "friction.load@elbow"),
+                  ("friction.position@elbow.least", "friction.load@elbow")],
+)  # fmt: skip
+def test_frictions_at_one_joint_add_up(frictions):
+    """The motion about which it is linear has all of them."""
+    simulator, scenario = moving(channels=("q.shoulder", "q.elbow"))
+    names = [p.name for p in simulator.parameters]
+    about = np.zeros(len(names))
+    about[[names.index(name) for name in frictions]] = 1.0, 0.1
+    pushed = about.copy()
+    pushed[names.index("force.bias@elbow")] = 1e-3
+    still, moved = simulator.simulate_lanes(np.stack([about, pushed]), [scenario] * 2)
+    effect = next(e for e in simulator.effects if e.name == "force.bias@elbow")
+    tangent = Linear(simulator, about, scenario, np.zeros(2), np.zeros(2))
+    seen = tangent.responses([(effect, np.array([1e-3]))])[0][0]
+    off = np.sqrt(np.square(seen - (moved - still)).sum() / np.square(moved - still).sum())
+    assert off < 0.02
+
+
 def test_initial_states_move_a_run_as_their_derivatives_say():
     simulator, scenario = moving(channels=("q.shoulder", "q.elbow"))
     size = len(simulator.parameters)

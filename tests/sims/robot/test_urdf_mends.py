@@ -2,6 +2,8 @@
 
 import itertools
 
+import mujoco
+import numpy as np
 import pytest
 
 from sims.robot.reading import UNDRIVEN, read
@@ -137,9 +139,28 @@ def test_mimics_follow(mended):
     robot_, notes = mended(
         robot(link("base", None), link("arm"), link("tip"), joint("j", "base", "arm"), follower)
     )
-    assert notes == ["mimic joints follow by MuJoCo's soft equality: k = -2 j + 0.5"]
+    assert notes == ["mimic joints follow as stiffly as MuJoCo allows: k = -2 j + 0.5"]
     assert robot_.compiled.neq == 1
     assert list(robot_.compiled.eq_data[0][:2]) == [0.5, -2]
+
+
+def test_mimics_follow_rigidly(mended):
+    """A torque at one joint moves both alike; by MuJoCo's default equality 0.2 mrad apart."""
+    follower = joint("k", "arm", "tip", "revolute", '<mimic joint="j"/>')
+    tied, _ = mended(
+        robot(link("base", None), link("arm"), link("tip"), joint("j", "base", "arm"), follower)
+    )
+    model = tied.compiled
+    model.opt.gravity[:] = 0
+    data = mujoco.MjData(model)
+    rows = []
+    for step in range(300):
+        data.qfrc_applied[0] = 5.0 * np.sin(0.05 * step)
+        mujoco.mj_step(model, data)
+        rows.append(data.qpos.copy())
+    first, second = np.array(rows).T
+    assert np.abs(first).max() > 0.02
+    assert np.abs(first - second).max() < 1e-6
 
 
 def test_a_mimic_of_nothing_is_left_out(mended):

@@ -229,6 +229,12 @@ def test_a_urdf_says_what_it_can(tmp_path: Path) -> None:
     assert "<!-- the elbow -->" in done.urdf
     unsaid = {line.partition(":")[0] for line in done.said if "not in the URDF" in line}
     assert unsaid == {"inertia.armature@elbow", "inertia.scale@fore"}
+    stiff = "a URDF cannot say that dry friction is stiff"
+    assert stiff in done.urdf
+    soft = written(arm.with_friction_form("soft"), causes, "log.csv")
+    assert soft.urdf is not None
+    assert 'friction="0.05"' in soft.urdf
+    assert stiff not in soft.urdf
     assert done.xml is not None
     assert "inertia.armature@elbow" in done.xml
     wrong = replace(done, urdf=done.urdf.replace('friction="0.05"', 'friction="0.06"'))

@@ -1,0 +1,188 @@
+"""Dry friction in MuJoCo's soft form: effects move a robot as plain MuJoCo moves its file."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from sims.base import InputError, Scenario
+from sims.extended import Extended, Number, load, read, robot_of, write
+from sims.robot.instants import friction_damping
+from sims.robot.linear import Linear
+from sims.robot.model import Robot
+from sims.robot.numerics import INTEGRATORS
+from sims.robot.reading import read as read_robot
+from sims.robot.simulator import robot_simulator
+from sims.robot.writing import written
+
+ARM = """<mujoco>
+<option timestep="0.002" integrator="{integrator}"/>
+<worldbody><body name="upper">
+  <joint name="shoulder" axis="0 1 0" damping="0.05"/>
+  <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="1" contype="0" conaffinity="0"/>
+  <body name="fore" pos="0 0 -0.3">
+    <joint name="elbow" axis="0 1 0" damping="0.03" {elbow}/>
+    <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.25" mass="0.5" contype="0"
+          conaffinity="0"/>
+  </body>
+</body></worldbody>
+<actuator><motor name="m1" joint="shoulder"/><motor name="m2" joint="elbow"/></actuator>
+</mujoco>"""
+STEPS = 500
+CONTROLS = np.array([1.5, 0.5]) * np.sin(np.arange(STEPS)[:, None] * 0.002 * np.array([5.0, 8.0]))
+"""(STEPS, 2) torques, N m, constant over each step."""
+START = (0.4, -0.6)
+"""Initial positions, rad."""
+
+
+def simulator(folder, integrator="implicitfast", elbow="", form="soft", effects=()):
+    path = Path(folder) / "arm.xml"
+    path.write_text(ARM.format(integrator=integrator, elbow=elbow))
+    kind = robot_simulator(read_robot(path)).with_friction_form(form)
+    return kind(observe=["q.shoulder", "q.elbow"], effects=list(effects))
+
+
+def scenario():
+    times = 0.002 * np.arange(STEPS + 1)
+    held = np.concatenate([CONTROLS, CONTROLS[-1:]])
+    inputs = {"u.m1": held[:, 0], "u.m2": held[:, 1]}
+    return Scenario(times, {"q.shoulder": START[0], "q.elbow": START[1]}, inputs)
+
+
+def plain(text):
+    """Positions (STEPS + 1, 2) by `mj_step`, of a model file."""
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    data.qpos[:] = START
+    rows = [data.qpos.copy()]
+    for control in CONTROLS:
+        data.ctrl[:] = control
+        mujoco.mj_step(model, data)
+        rows.append(data.qpos.copy())
+    return np.array(rows)
+
+
+def off(seen, true):
+    """RMS error as a share of the true change."""
+    return np.sqrt(np.square(seen - true).sum() / np.square(true).sum())
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("stated", ["", 'solreffriction="0.05 1" solimpfriction="0.8 0.9 0.001"'])
+def test_soft_friction_is_that_of_the_file_with_the_same_frictionloss(tmp_path, integrator, stated):
+    """A native effect, and one whose limit is asked for in every step."""
+    native = simulator(tmp_path, integrator, stated, effects=["friction.coulomb@elbow"])
+    seen = native.simulate(np.array([[0.06]]), scenario())[0]
+    wanted = plain(ARM.format(integrator=integrator, elbow=f'frictionloss="0.06" {stated}'))
+    np.testing.assert_allclose(seen, wanted, atol=1e-10)
+    asked = simulator(tmp_path, integrator, stated, effects=["friction.position@elbow"])
+    names = [p.name.rpartition(".")[2] for p in asked.parameters]
+    theta = np.array([[{"least": 0.06}.get(name, 0.0) for name in names]])
+    assert theta.any()
+    np.testing.assert_allclose(asked.simulate(theta, scenario())[0], wanted, atol=1e-10)
+    stiff = simulator(tmp_path, integrator, stated, "stiff", ["friction.coulomb@elbow"])
+    assert np.abs(stiff.simulate(np.array([[0.06]]), scenario())[0] - wanted).max() > 1e-3
+
+
+def test_friction_damping_is_that_of_the_constraint(tmp_path):
+    """MuJoCo's own reference acceleration of a constraint for friction loss is -b v."""
+    for stated in ("", 'solreffriction="0.001 1"', 'solreffriction="-3 -70"',
+                   'solimpfriction="0.7 0.9 0"',
+                   'solimpfriction="1 1 0.001"'):  # fmt: skip
+        text = ARM.format(integrator="Euler", elbow=f'frictionloss="0.06" {stated}')
+        robot = Robot(Path("arm.xml"), "mjcf", mujoco.MjSpec.from_string(text))
+        model = robot.compiled
+        data = mujoco.MjData(model)
+        data.qvel[:] = (0.0, 0.3)
+        mujoco.mj_forward(model, data)
+        assert data.efc_type.tolist() == [mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF]
+        damping, impedance = friction_damping(robot.with_friction_form("soft"), 1)
+        assert -damping * 0.3 == pytest.approx(data.efc_aref[0])
+        assert impedance == pytest.approx(data.efc_KBIP[0, 2])
+        assert friction_damping(robot, 1) == pytest.approx((1 / 0.002 / 0.9999, 0.9999))
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+@pytest.mark.parametrize("already", [0.0, 0.05])
+def test_the_tangent_of_soft_friction_is_what_a_small_change_makes(tmp_path, integrator, already):
+    effects = ["friction.coulomb@elbow", "friction.coulomb@shoulder"]
+    soft = simulator(tmp_path, integrator, effects=effects)
+    theta = np.array([already, 0.0])
+    tangent = Linear(soft, theta, scenario(), np.array(START), np.zeros(2))
+    for number, effect in enumerate(soft.effects):
+        more = theta + 0.002 * np.eye(2)[number]
+        before, after = soft.simulate(np.stack([theta, more]), scenario())
+        (seen,), _ = tangent.responses([(effect, np.array([0.002]))])
+        assert off(seen, after - before) < (0.08 if already else 0.02)
+
+
+def test_each_form_has_a_tangent_of_its_own(tmp_path):
+    """The tangent of stiff friction does not follow soft friction, which reverses earlier."""
+    small = np.array([0.002])
+    seen, true = {}, {}
+    for form in ("soft", "stiff"):
+        arm = simulator(tmp_path, form=form, effects=["friction.coulomb@elbow"])
+        before, after = arm.simulate(np.stack([0 * small, small]), scenario())
+        tangent = Linear(arm, 0 * small, scenario(), np.array(START), np.zeros(2))
+        seen[form], true[form] = tangent.responses([(arm.effects[0], small)])[0][0], after - before
+    assert off(seen["stiff"], true["soft"]) > 3 * off(seen["soft"], true["soft"])
+    assert off(seen["soft"], true["stiff"]) > 2 * off(seen["stiff"], true["stiff"])
+
+
+@pytest.fixture
+def extended(tmp_path):
+    """An extended simulator with soft friction at the elbow."""
+    kind = type(simulator(tmp_path))
+    effects = {"friction.coulomb@elbow": {"coefficient": Number(0.06, "N*m", 0.059, 0.061)}}
+    observe = ["q.shoulder", "q.elbow"]
+    return Extended(
+        "arm_extended", "arm", None, "a log", {}, effects, {}, observe, kind, robot_of(kind)
+    )
+
+
+def test_extended_toml_states_the_form(extended, tmp_path):
+    path = tmp_path / "extended.toml"
+    write(extended, path)
+    assert 'friction_form = "soft"' in path.read_text()
+    assert read(path).robot.friction_form == "soft"
+    fitted = load(path, lambda _: None)()
+    theta = np.array([[p.nominal for p in fitted.parameters]])
+    wanted = plain(ARM.format(integrator="implicitfast", elbow='frictionloss="0.06"'))
+    np.testing.assert_allclose(fitted.simulate(theta, scenario())[0], wanted, atol=1e-10)
+
+
+def test_extended_toml_without_the_form_is_stiff(extended, tmp_path):
+    path = tmp_path / "extended.toml"
+    write(extended, path)
+    soft = load(path, lambda _: None)
+    path.write_text(path.read_text().replace('friction_form = "soft"\n', ""))
+    stiff = load(path, lambda _: None)
+    assert stiff.robot.friction_form == "stiff"
+    assert stiff.source_digest != soft.source_digest
+    kind = extended.kind.with_friction_form("stiff")
+    assert kind.source_digest != extended.kind.source_digest
+    write(Extended(**{**vars(extended), "kind": kind, "robot": robot_of(kind)}), path)
+    assert "friction_form" not in path.read_text()
+
+
+def test_a_form_that_does_not_exist_is_refused(extended, tmp_path):
+    path = tmp_path / "extended.toml"
+    write(extended, path)
+    path.write_text(path.read_text().replace('"soft"', '"spongy"'))
+    with pytest.raises(InputError, match="friction_form: expected stiff or soft, found 'spongy'"):
+        read(path)
+
+
+@pytest.mark.parametrize("form", ["soft", "stiff"])
+def test_the_model_file_states_solver_parameters_of_stiff_friction_alone(extended, form):
+    robot = extended.kind.robot.with_friction_form(form)
+    done = written(robot, extended.effects, "log.csv")
+    assert 'frictionloss="0.06"' in done.xml
+    assert ("solreffriction=" in done.xml) == (form == "stiff")
+    (line,) = done.said
+    assert ("soft form" in line) == (form == "soft")
+    moved = plain(done.xml)
+    kind = extended.kind.with_friction_form(form)
+    arm = kind(observe=["q.shoulder", "q.elbow"], effects=["friction.coulomb@elbow"])
+    np.testing.assert_allclose(arm.simulate(np.array([[0.06]]), scenario())[0], moved, atol=1e-9)
