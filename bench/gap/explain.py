@@ -21,7 +21,7 @@ from bench.gap.causes.structure import probes, remains
 from bench.gap.design import Design, design
 from bench.gap.explanation import Explanation
 from bench.gap.freeze import frozen
-from bench.gap.friction_form import choose_friction_form, has_dry_friction, soft_kind
+from bench.gap.friction_form import soft_kind
 from bench.gap.held_out import HeldOutRuns
 from bench.gap.model.base_fit import LAST_STEPS, Base, fit_base, without_step
 from bench.gap.model.crew import Crew
@@ -256,9 +256,7 @@ class _Explainer:
             raise self._fails()
         # One stream for surrogates and bootstrap: the same seed tells the same story.
         rng = self._rng()
-        search = self._search(base, rng)
-        finding = self._finding(search)
-        base, search, finding = self._with_friction_form(base, search, finding)
+        base, search, finding = self._searched(base, rng)
         self.watch.stage("measuring the gain")
         verdict = self.assessor.verdict(search, finding, rng, self.started)
         verdict = replace(verdict, recording_faults=self.faults)
@@ -268,37 +266,28 @@ class _Explainer:
         story = Teller(self.assessor, search, base, finding, self.notes).story(verdict)
         return Explanation(verdict, story, self._extended(search, finding))
 
-    def _with_friction_form(
-        self, base: Base, search: Search, finding: Finding
-    ) -> tuple[Base, Search, Finding]:
-        """Search again with MuJoCo's soft form of dry friction, where it fits better than stiff
-        friction what was found; otherwise return what was found.
-        """
-        model = finding.model
-        if not model.names and finding.verdict != "adequate":
-            model = max(search.models.values(), key=lambda model: model.merit)
-        if self.faults or self.watch.left() or not has_dry_friction(self.fitting, model.names):
-            return base, search, finding
-        self.watch.stage("comparing the two forms of dry friction")
-        stiff = self.kind, self.fitting, self.measuring
-        assessor = self.assessor
+    def _searched(self, base: Base, rng: np.random.Generator) -> tuple[Base, Search, Finding]:
+        """Search and judge; again with MuJoCo's soft form of dry friction where the data show it."""
+        search = self._search(base, rng)
+        if not self.kind.has_model:
+            return base, search, self._finding(search)
+        # Loaded where there is a robot alone.
+        from bench.gap.prediction_error.search import SoftFrictionError
+
+        try:
+            return base, search, self._finding(search)
+        except SoftFrictionError:
+            self.say(SOFT_FRICTION)
+        before = self.assessor.before
         self._enter(soft_kind(self.kind))
-        self.assessor = replace(self.assessor, before=assessor.before)
-        soft = choose_friction_form(search, model, self.fitting, SWITCH)
-        if soft is not None:
-            self.fitting.correction = None
-            fitter = Fitter(self.fitting, self.noise, base.frozen)
-            (fit,) = fitter.fit([base.fit.start()], LAST_STEPS)
-            soft_base = without_step(self.fitting, self.noise, replace(base, fit=fit))
-            soft_search = self._search(soft_base, self._rng())
-            soft_search.refit([soft.fit.start()], race=False)
-            soft_finding = self._finding(soft_search)
-            if soft_finding.model.merit > finding.model.merit:
-                self.say(SOFT_FRICTION)
-                return soft_base, soft_search, soft_finding
-        self._return(*stiff)
-        self.assessor = assessor
-        return base, search, finding
+        self.assessor = replace(self.assessor, before=before)
+        self._follow()
+        fitter = Fitter(self.fitting, self.noise, base.frozen)
+        start = replace(base.fit.start(), states=self.fitting.guess)
+        (fit,) = fitter.fit([start], LAST_STEPS)
+        base = without_step(self.fitting, self.noise, replace(base, fit=fit))
+        search = self._search(base, self._rng())
+        return base, search, self._finding(search)
 
     def _finding(self, search: Search) -> Finding:
         """What the simulator lacks; no cause where the recording states a unit or a sign wrongly,
@@ -308,10 +297,19 @@ class _Explainer:
         if not self.faults:
             held_out = HeldOutRuns(self.measuring, self.noise) if self.measuring else None
             finding = self.assessor.judged(search, name(search, held_out))
-            self.faults = self._imitated(search, finding)
+            self.faults = self._imitated(search, finding) or self._unexplained(search, finding)
             if not self.faults:
                 return finding
         return Finding("unknown", base, base, (), remains(search, base))
+
+    def _unexplained(self, search: Search, finding: Finding) -> tuple[RecordingFault, ...]:
+        """Wrong units and signs of a robot's recording that no effect explains."""
+        explained = finding.verdict in ("adequate", "named", "ambiguous")
+        if not self.kind.has_model or self.free_numbers or explained or self.watch.left():
+            return ()
+        base = Base(search.base.fit, frozenset(search.frozen))
+        fault = wrong_units(self._units, self.fitting, self.noise, base)
+        return () if fault is None else (fault,)
 
     def _imitated(self, search: Search, finding: Finding) -> tuple[RecordingFault, ...]:
         """Wrong units and signs that causes stand for."""
@@ -366,12 +364,36 @@ class _Explainer:
         """The base model; of a robot with the step that the data ask for, the file's or a finer
         one.
         """
+        if self.kind.has_model:
+            self._follow()
         base = fit_base(self.fitting, self.noise, self._given())
+        if self.kind.has_model and not self.free_numbers:
+            # Of a robot units are questioned where no effect explains the gap.
+            return self._prepared(base)
         if not self.watch.left():
             fault = wrong_units(self._units, self.fitting, self.noise, base)
             self.faults = (fault,) if fault is not None else ()
-        if self.faults or not self.kind.has_model:
-            return base
+        return base if self.faults or not self.kind.has_model else self._prepared(base)
+
+    @property
+    def free_numbers(self) -> bool:
+        """Whether the base model has parameters."""
+        return bool(self.fitting.base.size)
+
+    def _follow(self) -> None:
+        """Estimate where the runs of a robot begin, by a filter with the model as it stands."""
+        # Loaded where there is a robot alone.
+        from bench.gap.prediction_error.candidate_responses import FollowedRuns
+
+        for world in (self.fitting, self.measuring):
+            if world is not None:
+                self.watch.stage("following the runs with the model")
+                world.follow(FollowedRuns.follow(world, world.nominal(), self.noise, None))
+
+    def _prepared(self, base: Base) -> Base:
+        """The base model of a robot with the step that the data ask for, and without free numbers
+        that they cannot fix.
+        """
         if self._shows_steps(base):
             base = self._stepped(base)
         base = self._frozen(base)

@@ -36,7 +36,7 @@ def has_dry_friction(world: World, names: Iterable[str]) -> bool:
     if not robot.has_model:
         return False
     freed: list[type[Effect]] = list(robot.system.freed_effects)
-    plain = [_plain_friction(world, name) for name in names]
+    plain = [plain_friction(world, name) for name in names]
     effects = [*(type(world.effects[name]) for name in plain), *freed]
     return any(_is_dry_friction(effect) for effect in effects)
 
@@ -92,7 +92,7 @@ def _refit_in(world: World, models: Models, model: Model) -> Model:
     theta = model.fit.theta.copy()
     names: list[str] = []
     for name in model.names:
-        plain = _plain_friction(models.world, name)
+        plain = plain_friction(models.world, name)
         if plain != name:
             # The first coefficient of both is the limit of the friction.
             theta[world.places(plain)[0]] += theta[world.places(name)[0]]
@@ -119,7 +119,7 @@ def _is_dry_friction(effect: type[Effect]) -> bool:
     return issubclass(effect, Friction) or any(isinstance(one, Friction) for one in members)
 
 
-def _plain_friction(world: World, name: str) -> str:
+def plain_friction(world: World, name: str) -> str:
     """The dry friction that an effect with a state contains; other effects themselves."""
     effect = world.effects[name]
     if effect.hook != "hidden":

@@ -22,6 +22,8 @@ from sims.base import Array
 
 STAGES = ((0.2, 6), (0.45, 6), (0.7, 6), (1.0, 10))
 """Shares of a run over which its initial state is fitted one after another, and steps of each."""
+FOLLOWED = ((1.0, 6),)
+"""The same of a robot whose runs a filter has followed: they begin near their best states."""
 BENT = 0.3
 """RMS, in units of the noise, by which a motion may miss what derivatives by its initial states
 make of it, before these are taken anew.
@@ -67,8 +69,9 @@ class HeldOutRuns:
         """
         guess = self.world.guess
         begun = [Start((), theta, guess) for theta in thetas]
-        fits = self._fitted(begun, STAGES)
-        if self._bends(_nearest(fits)):
+        followed = self.world.followed is not None
+        fits = self._fitted(begun, FOLLOWED if followed else STAGES)
+        if not followed and self._bends(_nearest(fits)):
             fits = self._led(begun, fits)
         nearest = _nearest(fits)
         # Asked this way round, since a fit that failed has a cost that is no number.

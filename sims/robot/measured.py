@@ -132,6 +132,11 @@ class MeasuredLinear(Linear):
         return self._steps + 1
 
     @property
+    def positions(self) -> int:
+        """Number of positions in a state, those of joints in series included."""
+        return int(self._motion.x.shape[1])
+
+    @property
     def trajectory(self) -> Trajectory:
         """The motion about which the model is linearised."""
         return Trajectory(self._motion.x, self._motion.v, self._motion.afloat)

@@ -62,14 +62,26 @@ def name(search: Search, held_out: HeldOutRuns | None) -> Finding:
         search: with the base model entered.
         held_out: the runs for measuring; None if there are none.
     """
-    inquiry = _Inquiry(search, held_out)
+    inquiry = _inquiry(search, held_out)
     try:
         return inquiry.answered()
     except EndedError:
         return inquiry.so_far()
 
 
-class _Inquiry:
+def _inquiry(search: Search, held_out: HeldOutRuns | None) -> Inquiry:
+    """Questions about a robot are asked by prediction errors."""
+    if not search.world.linear:
+        return Inquiry(search, held_out)
+    # Loaded where there is a robot alone.
+    from bench.gap.prediction_error.confirmation import Confirmation
+    from bench.gap.prediction_error.search import PredictionErrorSearch
+
+    assert isinstance(search, PredictionErrorSearch)
+    return Confirmation(search, held_out)
+
+
+class Inquiry:
     """The questions in their order, and what has been answered.
 
     Args:
@@ -96,7 +108,7 @@ class _Inquiry:
             raise EndedError
         # Without motion nothing is asked further: any test of such residuals is one of rounding.
         if shows_nothing(search):
-            return _without_motion(search)
+            return without_motion(search)
         base = search.base
         vague = unfixed(search, base)
         # The same goes for a base that is not fixed: causes would stand for values of it.
@@ -104,7 +116,7 @@ class _Inquiry:
             left = remains(search, base)
             return Finding(verdict_of(State(fixed=False)), base, base, (), left, vague)
         self._watch.begin("search")
-        self._model = search.run() if search.world.linear else sought(search)
+        self._model = sought(search)
         self._watch.begin("rivals")
         self._model = search.plainer(settle(search, self._model))
         self._model = search.to_the_end(self._model)
@@ -196,7 +208,7 @@ def shows_nothing(search: Search) -> bool:
     return rules.shows_nothing(ranges, left, search.noise.sigma, touched)
 
 
-def _without_motion(search: Search) -> Finding:
+def without_motion(search: Search) -> Finding:
     base, world = search.base, search.world
     # Nothing can be known of any of them, and no test of what is left would mean anything.
     vague = tuple(world.parameters[i].name for i in world.base)

@@ -39,6 +39,8 @@ class Horizon(NamedTuple):
     iterations: int
 
 
+FOLLOWED = (Horizon(1.0, 6),)
+"""The same of a robot whose runs a filter has followed: they begin near their best states."""
 HORIZONS = (Horizon(0.2, 6), Horizon(0.45, 6), Horizon(1.0, 20))
 """Fitted one after another: the end of a run depends on its beginning in ways that only a nearly
 fitted model follows.
@@ -79,12 +81,12 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
         starts = [starts[i] for i in order[:KEPT]]
 
     fits: list[Fit] = []
-    for horizon in HORIZONS:
+    for horizon in HORIZONS if world.followed is None else FOLLOWED:
         world.watch.tell(f"base fit, first {horizon.share:.0%} of the runs")
         fits = Fitter(world, noise, share=horizon.share).fit(starts, horizon.iterations)
         starts = [fit.start() for fit in fits]
     best = min(fits, key=lambda fit: fit.cost)
-    if world.linear:
+    if world.linear and world.followed is None:
         # what was taken about the first start is taken about the fitted model, for all that follow
         # loaded where there is a robot alone
         from bench.gap.model.tangents import begun

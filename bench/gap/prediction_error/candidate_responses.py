@@ -125,7 +125,12 @@ class FollowedRuns:
 
     @classmethod
     def follow(
-        cls, world: World, theta: Array, noise: Noise, trajectories: Sequence[Trajectory] | None
+        cls,
+        world: World,
+        theta: Array,
+        noise: Noise,
+        trajectories: Sequence[Trajectory] | None,
+        simulator: RobotSimulator | None = None,
     ) -> FollowedRuns:
         """Linearise a model about the measured motion and filter the runs.
 
@@ -134,6 +139,7 @@ class FollowedRuns:
             theta: (P,) parameters of the model.
             noise: of the sensors.
             trajectories: the motion of each run, if it has been estimated before.
+            simulator: in place of that of the world.
         """
         again = RELINEARISED if trajectories is None else 1
         followed: FollowedRuns | None = None
@@ -143,7 +149,9 @@ class FollowedRuns:
             # Jacobians change little from one motion to another near the data.
             nearby = linear or [None] * len(world.tracks)
             linear = [
-                _linearised(world, theta, noise, run, trajectories and trajectories[run], near)
+                _linearised(
+                    world, theta, noise, run, trajectories and trajectories[run], near, simulator
+                )
                 for run, near in enumerate(nearby)
             ]
             maps = [one.interval_maps() for one in linear]
@@ -265,6 +273,48 @@ class FollowedRuns:
         found = self._through_filter(columns.pushed, columns.readings, inputs)
         return found[..., columns.places] / columns.sizes.astype(np.float32)
 
+    def state_sensitivities(self) -> Array:
+        """Return the derivatives (R, T, C, 2 D) of the readings by the first positions and
+        velocities of D joints, without any feedback of the readings.
+        """
+        number, samples, channels = self.runs.residuals.shape
+        size, count = self.runs.prior.size, len(self.world.states)
+        joints = len(self.linear[0].trajectory.x[0])
+        own = np.concatenate([np.arange(joints), size_of_positions(self) + np.arange(joints)])
+        result = np.zeros((number, samples, channels, count))
+        s = np.zeros((number, size, own.size))
+        s[:, own, np.arange(own.size)] = 1.0
+        for i in range(samples):
+            result[:, i, :, : own.size] = self.runs.readings[:, i] @ s
+            if i + 1 < samples:
+                s = self.runs.states[:, i] @ s
+        result[~np.isfinite(result)] = 0.0
+        return result
+
+    def output_sensitivities(self, probes: Sequence[Probe]) -> Array:
+        """Return what candidates change about the readings of simulated runs (R, T, C, K), by (1)
+        without gain.
+        """
+        columns = self.columns(probes)
+        number, samples, channels, count = columns.readings.shape
+        size = self.runs.prior.size
+        result = np.zeros((number, samples, channels, count))
+        s = np.zeros((number, size, count))
+        for i in range(samples):
+            result[:, i] = columns.readings[:, i] + self.runs.readings[:, i] @ s
+            if i + 1 < samples:
+                s = self.runs.states[:, i] @ s + self.runs.inputs[:, i] @ columns.pushed[:, i]
+        result[~np.isfinite(result)] = 0.0
+        return result[..., columns.places] / columns.sizes
+
+    def first_states(self) -> Array:
+        """Return smoothed positions and velocities of the joints at the first samples (R, 2 D)."""
+        found = []
+        for linear, trajectory in zip(self.linear, self.trajectories(), strict=True):
+            first = int(linear.knots[0])
+            found.append(np.concatenate([trajectory.x[first], trajectory.v[first]]))
+        return np.array(found)
+
     def _through_filter(
         self, pushed: Array, readings: Array, inputs: Array | None = None
     ) -> Array:
@@ -304,6 +354,11 @@ _NOTHING = Smoothed(*(np.zeros(0) for _ in range(3)))
 """Stand for what has not been computed yet."""
 
 
+def size_of_positions(followed: FollowedRuns) -> int:
+    """Return the number of positions in the states, those of joints in series included."""
+    return int(followed.linear[0].positions)
+
+
 def _linearised(
     world: World,
     theta: Array,
@@ -311,16 +366,18 @@ def _linearised(
     run: int,
     trajectory: Trajectory | None,
     nearby: MeasuredLinear | None,
+    simulator: RobotSimulator | None = None,
 ) -> MeasuredLinear:
     """Linearise the model of one run about a motion, at first that of its readings alone."""
     half = len(world.states) // 2
     scenario = world.tracks[run].scenario
     start = world.guess[run, :half], world.guess[run, half:]
+    robot = simulator or world.simulator
     given = trajectory
     if given is None:
         states = measured_states(world, noise.sigma, run)
-        return MeasuredLinear(world.simulator, theta, scenario, start, measured=states)
-    return MeasuredLinear(world.simulator, theta, scenario, start, given, nearby=nearby)
+        return MeasuredLinear(robot, theta, scenario, start, measured=states)
+    return MeasuredLinear(robot, theta, scenario, start, given, nearby=nearby)
 
 
 def _prior(world: World, size: int) -> Array:

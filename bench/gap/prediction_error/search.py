@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,16 +22,26 @@ from bench.gap.causes.candidates import Probe, _first
 from bench.gap.causes.gains import Group
 from bench.gap.causes.score_test import Scores
 from bench.gap.causes.joint_hats import JointHat
+from bench.gap.causes.rules import SWITCH
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import hat_probes
+from bench.gap.friction_form import (
+    choose_friction_form,
+    has_dry_friction,
+    plain_friction,
+    soft_kind,
+)
 from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.models import Model
-from bench.gap.model.problem import Fit, Start
+from bench.gap.model.problem import Fit, Known, Start
+from bench.gap.model.world import World
 from bench.gap.prediction_error.candidate_responses import Columns, FollowedRuns
 from bench.gap.prediction_error.identification import Selected, identify, regress
 from bench.gap.prediction_error.null_distribution import null_scores
 from bench.gap.prediction_error.selection import Regression
 from sims.base import Array
+from sims.robot.series import is_series
+from sims.robot.simulator import RobotSimulator
 from sims.system import Effect
 
 MANY_SHAPES = frozenset(
@@ -57,6 +68,10 @@ SILENT = 0.03
 """Excess over the noise below which a fitted set leaves nothing to explain."""
 
 
+class SoftFrictionError(Exception):
+    """Dry friction of these data has MuJoCo's soft form: search with a simulator of that form."""
+
+
 @dataclass
 class PredictionErrorSearch(Search):
     """A search whose candidates come from prediction errors.
@@ -68,8 +83,9 @@ class PredictionErrorSearch(Search):
     selections: list[Selected] = field(default_factory=list)
     _columns: Columns | None = None
     _hats: Columns | None = None
-    _followed: dict[frozenset[str], FollowedRuns] = field(default_factory=dict)
-    _regressions: dict[frozenset[str], Regression] = field(default_factory=dict)
+    _followed: dict[bytes, FollowedRuns] = field(default_factory=dict)
+    _regressions: dict[bytes, Regression] = field(default_factory=dict)
+    _own: dict[bytes, dict[str, list[int]]] = field(default_factory=dict)
 
     def run(self) -> Model:
         """Return the model of all effects that the data show."""
@@ -80,7 +96,10 @@ class PredictionErrorSearch(Search):
         watch.stage("selecting effects", 1)
         selected = identify(followed, columns)
         self.selections.append(selected)
-        best = self._confirmed(selected, self.base)
+        softer = self._may_be_soft(selected)
+        best = self._confirmed(selected, self.base, plain=softer)
+        if softer and not self._is_explained(best) and self._is_softer(best):
+            raise SoftFrictionError
         if not self._is_explained(best):
             needed = selected.followed.needs_process_noise() > NEEDED
             joints = {int(j) for j in np.flatnonzero(needed)}
@@ -92,11 +111,52 @@ class PredictionErrorSearch(Search):
                 selected = identify(followed, columns)
                 self.selections.append(selected)
                 best = max(best, self._confirmed(selected, best), key=lambda model: model.merit)
-        best = self._with_rivals(best, selected)
-        # All rivals have been fitted: none is asked for by simulation again.
-        self.settled = frozenset(best.names)
         self.supported = best
         return best
+
+    def _is_softer(self, model: Model) -> bool:
+        """Whether a fitted model with dry friction is likelier in MuJoCo's soft form."""
+        world = self.world
+        if not has_dry_friction(world, model.names):
+            return False
+        kind = soft_kind(world.kind)
+        runs, free = world.runs, [p.name for p in world.freed]
+        other = World(kind, world.recording, runs, world.engine, world.extra, free, world.library)
+        other.watch, other.crew = world.watch, world.crew
+        other.guess, other.derivatives = world.guess, world.derivatives
+        self.world.crew.join(other)
+        soft = choose_friction_form(self, model, other, SWITCH)
+        other.close()
+        return soft is not None
+
+    def _may_be_soft(self, selected: Selected) -> bool:
+        """Whether dry friction that was selected follows the data better in MuJoCo's soft form."""
+        world = self.world
+        robot: Any = world.kind
+        if not has_dry_friction(world, selected.effects) or robot.robot.friction_form == "soft":
+            return False
+        theta = self._plain_theta(self._start(selected.groups, selected.coefficients))
+        followed = self.follow()
+        motion = followed.trajectories()
+        effects = [*world.library, *world.extra]
+        likelihoods = []
+        for kind in (world.kind, soft_kind(world.kind)):
+            simulator = kind(world.recording.constants, world.channels, effects=effects)
+            assert isinstance(simulator, RobotSimulator)
+            own = FollowedRuns.follow(world, theta, followed.noise, motion, simulator)
+            likelihoods.append(float(own.filtered.log_likelihood.sum()))
+        return 2.0 * (likelihoods[1] - likelihoods[0]) > SWITCH
+
+    def _plain_theta(self, start: Start) -> Array:
+        """The parameters of a start with dry friction in place of laws with a state."""
+        world, theta = self.world, start.theta.copy()
+        for name in start.effects:
+            plain = plain_friction(world, name)
+            if plain != name:
+                # The first coefficient of both is the limit of the friction.
+                theta[world.places(plain)[0]] += theta[world.places(name)[0]]
+                theta[world.places(name)] = 0.0
+        return theta
 
     # -- the linear models
 
@@ -137,16 +197,25 @@ class PredictionErrorSearch(Search):
 
     # -- fits by simulation
 
-    def _confirmed(self, selected: Selected, best: Model) -> Model:
-        """Fit the selected set by simulation, and leave out effects that do not pay there."""
+    def _confirmed(self, selected: Selected, best: Model, plain: bool = False) -> Model:
+        """Fit the selected set by simulation, and leave out effects that do not pay there.
+
+        Args:
+            selected: the set.
+            best: the best model so far.
+            plain: take dry friction for the laws with a state that contain it.
+        """
         if not selected.groups:
             return best
-        self.refit([self._start(selected.groups, selected.coefficients)], race=False)
-        names = frozenset(self._names(selected.groups))
-        found = self.models[names]
+        start = self._start(selected.groups, selected.coefficients)
+        if plain:
+            names = dict.fromkeys(plain_friction(self.world, n) for n in start.effects)
+            start = replace(start, effects=tuple(names), theta=self._plain_theta(start))
+        self.refit([start], race=False)
+        found = self.models[frozenset(start.effects)]
         if not np.isfinite(found.fit.cost):
             return best
-        found = self.plainer(self.drop(found))
+        found = self.drop(found)
         if selected.shows_steps:
             found = self._corrected(found)
         return found if found.merit > best.merit else best
@@ -155,50 +224,45 @@ class PredictionErrorSearch(Search):
         """Whether a fitted model leaves no more than noise."""
         return self.quiet(model) and self.excess(model) < SILENT
 
-    def _with_rivals(self, best: Model, selected: Selected) -> Model:
+    def with_rivals(self, best: Model) -> Model:
         """Fit the sets that do nearly as well by the regression, and return the best of all."""
-        if not best.names:
+        if not best.names or not np.isfinite(best.fit.cost):
             return best
-        regression = selected.regression
         starts = []
-        chosen = self._groups_of(best, regression)
-        for place, group in enumerate(chosen):
-            rest = [other for other in chosen if other is not group]
-            gains = regression.gains(rest)
-            own = gains[list(regression.groups).index(group)]
-            order = np.argsort(-gains, kind="stable")
-            near: dict[str, Group] = {}
-            for i in order.tolist():
-                if gains[i] < own - RIVAL or len(near) == MAX_RIVALS:
-                    break
-                other = regression.groups[i]
-                if other.effect not in (*best.names, *near):
-                    near[other.effect] = other
-            for other in near.values():
-                groups = [*rest, other]
-                coefficients = regression.solve(groups)[1]
-                start = self._start(groups, coefficients, best.fit)
-                if frozenset(start.effects) not in self.models:
-                    starts.append(start)
+        for name in best.names:
+            for group, coefficients, behind in self._rivals(best, name):
+                names = tuple(n for n in best.names if n != name) + (group.effect,)
+                if behind > RIVAL or frozenset(names) in self.models:
+                    continue
+                theta = best.fit.theta.copy()
+                theta[self.world.slots[name]] = 0.0
+                theta[self.world.slots[group.effect]] = self._numbers(group, coefficients)
+                starts.append(Start(names, theta, best.fit.states))
         if starts:
             self.refit(starts, race=False)
         size = len(best.names)
         fitted = [m for m in self.models.values() if len(m.names) == size]
         return max(fitted, key=lambda model: model.merit)
 
-    def _groups_of(self, model: Model, regression: Regression) -> list[Group]:
-        """The groups of columns nearest to the shapes that a fitted model has."""
-        columns = self._columns
-        assert columns is not None
-        found = []
-        for name in model.names:
-            own = [g for g in regression.groups if g.effect == name]
-            if not own:
-                continue
-            gains = regression.gains(found)
-            places = [list(regression.groups).index(g) for g in own]
-            found.append(own[int(np.argmax(gains[places]))])
-        return found
+    def _rivals(self, model: Model, name: str) -> list[tuple[Group, Array, float]]:
+        """The effects that do nearly as well in the place of one: the best group of columns of
+        each, its coefficients, and how far it is behind in twice the log likelihood.
+        """
+        regression = self._regression(model)
+        own = self._own[self._key(model)][name]
+        rest = regression.instead_of(own)
+        gains = rest.gains([])
+        mine = rest.gain_of(own)
+        found: dict[str, tuple[Group, Array, float]] = {}
+        for i in np.argsort(-gains, kind="stable").tolist():
+            group = rest.groups[i]
+            behind = mine - float(gains[i])
+            if behind > RIVAL or len(found) == MAX_RIVALS:
+                break
+            library = group.effect in self.world.library
+            if library and group.effect not in (*model.names, *found):
+                found[group.effect] = group, rest.solve([group])[1][0], behind
+        return list(found.values())
 
     def _names(self, groups: Sequence[Group]) -> tuple[str, ...]:
         return tuple(group.effect for group in groups)
@@ -209,50 +273,63 @@ class PredictionErrorSearch(Search):
         """Where the fit of a set by simulation begins."""
         fit = fit or self.base.fit
         theta = self.base.fit.theta.copy()
-        columns = self._columns
-        assert columns is not None
         for group, own in zip(groups, coefficients, strict=True):
-            slot = self.world.slots[group.effect]
-            c = columns.probes[group.columns[0]].c.copy()
-            for column, value in zip(group.columns, own, strict=True):
-                probe = columns.probes[column]
-                if probe.fixed:
-                    # The change is that of this very size.
-                    c = probe.c.copy()
-                else:
-                    c[probe.place] = value
-            low, high = np.array(coefficient_bounds(self.world, group.effect)).T
-            theta[slot] = np.clip(c, low, high)
+            theta[self.world.slots[group.effect]] = self._numbers(group, own)
         return Start(self._names(groups), theta, fit.states)
+
+    def _numbers(self, group: Group, coefficients: Array) -> Array:
+        """The coefficients of an effect that a group of columns with these coefficients means."""
+        assert self._columns is not None
+        probes = self._columns.probes
+        c = probes[group.columns[0]].c.copy()
+        for column, value in zip(group.columns, coefficients, strict=True):
+            # A fixed change is that of this very size.
+            if not probes[column].fixed:
+                c[probes[column].place] = value
+        low, high = np.array(coefficient_bounds(self.world, group.effect)).T
+        found: Array = np.clip(c, low, high)
+        return found
 
     # -- scores
 
-    def _regression(self, model: Model, columns: Columns | None = None) -> Regression:
-        """The regression of innovations with a fitted model's effects in the linear model.
+    def _key(self, model: Model) -> bytes:
+        return model.fit.theta.tobytes()
 
-        Args:
-            model: a fitted model.
-            columns: of the candidates; the library where None.
+    def _regression(self, model: Model) -> Regression:
+        """The regression of innovations with a fitted model's effects in the model; candidates are
+        the library and hats.
         """
-        followed = self.follow()
-        kind = "library" if columns is None else "hats"
-        columns = self._plain_columns() if columns is None else columns
-        key = frozenset((kind, *model.names))
+        key = self._key(model)
         if key not in self._regressions:
-            # What the model has acts in its own steps, as what sticks does not in a linear model.
-            now = self._followed_by(model)
-            probes = [p for name in model.names for p in self._tangents(model, name)]
+            followed, now = self.follow(), self._followed_by(model)
+            columns = self._plain_columns().joined(self._hat_columns())
+            own: dict[str, list[int]] = {}
+            probes: list[Probe] = []
+            for name in model.names:
+                tangents = self._tangents(name, model.fit.theta[self.world.slots[name]])
+                first = len(columns.probes) + len(probes)
+                own[name] = list(range(first, first + len(tangents)))
+                probes += tangents
             joined = columns.joined(followed.columns(probes)) if probes else columns
             always = range(len(columns.probes), len(joined.probes))
             self._regressions[key] = regress(now, joined, always=always)
+            self._own[key] = own
         return self._regressions[key]
+
+    def _hat_columns(self) -> Columns:
+        """Forces of any shape as candidates, by the labels of their families."""
+        if self._hats is None:
+            probes, _ = hat_probes(self.world)
+            named = [replace(probe, effect=JointHat.name) for probe in probes]
+            self._hats = replace(self.follow().columns(named), probes=tuple(probes))
+        return self._hats
 
     def _followed_by(self, model: Model) -> FollowedRuns:
         """Return the runs as a filter follows them with a fitted model."""
         followed = self.follow()
         if not model.names:
             return followed
-        key = frozenset(model.names)
+        key = self._key(model)
         if key not in self._followed:
             found = FollowedRuns.follow(
                 self.world, model.fit.theta, followed.noise, followed.trajectories()
@@ -262,11 +339,10 @@ class PredictionErrorSearch(Search):
             self._followed[key] = found.refitted(replace(found.runs, defects=defects))
         return self._followed[key]
 
-    def _tangents(self, model: Model, name: str) -> list[Probe]:
-        """The change that an effect of a fitted model makes, and those with each of its
-        coefficients moved a little.
+    def _tangents(self, name: str, c: Array) -> list[Probe]:
+        """The change that an effect makes with these coefficients, and those with each of them
+        moved a little.
         """
-        c = model.fit.theta[self.world.slots[name]]
         bounds = coefficient_bounds(self.world, name)
         probes = [Probe(name, 0, 0, c, signed=True, fixed=True)]
         for place, (low, high) in enumerate(bounds):
@@ -290,15 +366,38 @@ class PredictionErrorSearch(Search):
                 self.chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
         return self.scored[key]
 
+    def with_sensitivities(self, start: Start) -> Start:
+        """Return a start with derivatives by its coefficients about the measured motion."""
+        if start.known is not None or not start.effects:
+            return start
+        base = [i for i in self.world.base.tolist() if i not in self.frozen]
+        if base:
+            return start
+        probes, free = [], []
+        for name in start.effects:
+            c = start.theta[self.world.slots[name]]
+            whole, *moved = self._tangents(name, c)
+            probes.append(whole)
+            probes += moved
+            free += list(self.world.places(name))
+        if any(is_series(self.world.effects[name]) for name in start.effects):
+            return start
+        changes = self.follow().output_sensitivities(probes)
+        columns, place = [], 0
+        for name in start.effects:
+            c = start.theta[self.world.slots[name]]
+            for k in range(c.size):
+                step = probes[place + 1 + k].c[k] - c[k]
+                columns.append((changes[..., place + 1 + k] - changes[..., place]) / step)
+            place += 1 + c.size
+        known = Known(np.array(free, dtype=np.intp), np.stack(columns, axis=3))
+        return replace(start, known=known)
+
     def force_of_any_shape(self, model: Model) -> tuple[float, str] | None:
         """Return the p-value of the best force of any shape, and what it follows."""
-        if self._hats is None:
-            probes, _ = hat_probes(self.world)
-            named = [replace(probe, effect=JointHat.name) for probe in probes]
-            columns = self.follow().columns(named)
-            self._hats = replace(columns, probes=tuple(probes))
-        regression = self._regression(model, self._hats)
-        scores = null_scores(regression, regression.effects, self.drawing("structure", model.names))
+        regression = self._regression(model)
+        labels = {probe.effect for probe in self._hat_columns().probes}
+        scores = null_scores(regression, labels, self.drawing("structure", model.names))
         return scores.p_value, scores.effects[0] if scores.effects else ""
 
     def missing(self, model: Model, larger: Model) -> float:

@@ -18,7 +18,7 @@ Miller, Subset Selection in Regression, 2nd ed., 2002, chapter 3). Nothing is si
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -84,6 +84,24 @@ class Regression:
         """Return the coefficient of the first column that is in every set, beside a set."""
         _, parts = self._solve([*chosen, self._nuisance])
         return float(parts[-1][0]) if self.always else 0.0
+
+    def instead_of(self, own: Sequence[int]) -> Regression:
+        """Return the regression without an effect that is in the model.
+
+        Args:
+            own: columns of the effect, which are in every set; the first is the whole change that
+                it makes.
+        """
+        whole, always = own[0], tuple(c for c in self.always if c not in own)
+        # The innovations as they are without it: e + w of its whole change.
+        crosses = self.crosses + self.grams[:, :, whole]
+        totals = self.totals + 2.0 * self.crosses[:, whole] + self.grams[:, whole, whole]
+        return replace(self, crosses=crosses, totals=totals, always=always)
+
+    def gain_of(self, own: Sequence[int]) -> float:
+        """Return what columns gain in twice the log likelihood, whatever their signs."""
+        group = Group("", tuple(own), (False,) * len(own))
+        return self.log_ratio(self.solve([])[0], self.solve([group])[0])
 
     def shows_nuisance(self, chosen: Sequence[Group]) -> bool:
         """Whether the first column that is in every set is in the data, beside a set."""

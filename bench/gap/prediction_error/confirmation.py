@@ -1,0 +1,106 @@
+"""Confirm by simulation what prediction errors select, and judge it.
+
+    1. The selected set, fitted to whole simulated runs, and its rivals.
+    2. Held-out runs: an effect that makes them worse is removed.
+    3. Is a force of any shape left (`bench.gap.causes.structure`)?
+    4. Which other effects explain the same as well?
+    5. The verdict, by the rules of `bench.gap.causes.rules`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scipy.special import chdtrc
+
+from bench.gap.causes.alternatives import Alternatives
+from bench.gap.causes.name import Finding, Inquiry, closed, shows_nothing, unfixed, without_motion
+from bench.gap.causes.rules import State, is_unexplained, verdict_of
+from bench.gap.causes.structure import remains
+from bench.gap.causes.trial import Trial
+from bench.gap.held_out import HeldOutRuns
+from bench.gap.model.models import Model
+from bench.gap.model.watch import EndedError
+from bench.gap.prediction_error.search import PredictionErrorSearch
+
+
+class Confirmation(Inquiry):
+    """The questions about a robot's recording, in their order.
+
+    Args:
+        search: with the base model entered.
+        held_out: the runs for measuring; None if there are none.
+    """
+
+    def __init__(self, search: PredictionErrorSearch, held_out: HeldOutRuns | None) -> None:
+        super().__init__(search, held_out)
+        self._robot = search
+
+    def answered(self) -> Finding:
+        """The finding when all is answered.
+
+        Raises:
+            EndedError: the search has to end before.
+        """
+        search, watch = self._robot, self._watch
+        if watch.left():
+            raise EndedError
+        if shows_nothing(search):
+            return without_motion(search)
+        base = search.base
+        vague = unfixed(search, base)
+        # Causes would stand for values of parameters that the data do not fix.
+        if vague:
+            left = remains(search, base)
+            return Finding(verdict_of(State(fixed=False)), base, base, (), left, vague)
+        watch.begin("search")
+        self._model = search.run()
+        watch.begin("rivals")
+        self._model = search.with_rivals(self._model)
+        self._measure()
+        watch.begin("structure")
+        self._model = search.to_the_end(self._model)
+        left = remains(search, self._model)
+        watch.begin("alternatives")
+        causes = _RobotAlternatives(search, self._trial, left.structure).evidence(self._model)
+        watch.check()
+        model, trial = self._model, self._trial
+        state = State(
+            causes=len(causes),
+            alternatives=any(cause.alternatives for cause in causes),
+            closed=closed(search, model, left),
+            unexplained=is_unexplained(left.structure, search.scan(model).p_value),
+            missed=trial is not None and trial.misses(model, left),
+        )
+        return self._finding(verdict_of(state), base, model, causes, left)
+
+    def _measure(self) -> None:
+        """Measure the models on the held-out runs, and remove effects that do not help there."""
+        if self._held_out is None or self._model is None:
+            return
+        search, model = self._robot, self._model
+        self._watch.begin("held_out")
+        names = set(model.names)
+        parts = [m for m in search.models.values() if set(m.names) < names and m.names]
+        size = len(names)
+        rivals = [m for m in search.models.values() if len(m.names) == size and m is not model]
+        rivals = [m for m in rivals if m.merit > model.merit - NEAR]
+        trial = Trial(self._held_out)
+        trial.measure([search.base, model, *parts, *rivals])
+        self._watch.check()
+        self._trial = trial
+        self._model = trial.without_idle(search, model)
+
+
+NEAR = 15.0
+"""Rivals this near in twice the log likelihood are measured on held-out runs."""
+
+
+@dataclass(frozen=True)
+class _RobotAlternatives(Alternatives):
+    """Collects alternatives of a robot's effects; p-values by the chi squared distribution."""
+
+    def _p_value(self, rest: Model, effect: str, gain: float) -> float:
+        slot = self.search.world.slots[effect]
+        candidates = len(self.search.world.library)
+        return float(min(candidates * chdtrc(slot.stop - slot.start, max(gain, 0.0)), 1.0))
