@@ -25,6 +25,7 @@ from tests.planted.robots import ROBOTS, MissingModelError
 
 def main(arguments):
     given = _parser().parse_args(arguments)
+    explain_command.end_when_terminated()
     if not given.simgap.is_file():
         print(f"{given.simgap}: no such command; expected bin/simgap of an installation (--simgap)")
         return 2

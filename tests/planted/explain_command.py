@@ -8,12 +8,13 @@ import signal
 import subprocess
 import tempfile
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 CPU_LIMIT = 120.0  # processor seconds of one call, all of its processes together
 WALL_FACTOR = 10.0  # a call that waits is ended after this multiple of the limit
 POLL_SECONDS = 0.1
+RUNNING = set()  # process groups of calls that are running
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -27,7 +28,7 @@ class Outcome:
         cpu: user and system seconds of all processes of the call.
         wall: elapsed seconds.
         memory: peak resident memory of the largest process, MB.
-        message: last lines that a call without a verdict printed.
+        output: what the call printed.
     """
 
     verdict: dict | None
@@ -35,10 +36,15 @@ class Outcome:
     cpu: float
     wall: float
     memory: float
-    message: str = field(default="")
+    output: str
+
+    @property
+    def message(self):
+        """Last lines that a call without a verdict printed."""
+        return "" if self.verdict else "\n".join(self.output.strip().splitlines()[-6:])[-1500:]
 
     def json(self):
-        return asdict(self)
+        return asdict(self) | {"output": "", "message": self.message}
 
 
 def explain(simgap, recording, out, cpu_limit=CPU_LIMIT, options=("--jobs", "1")):
@@ -64,6 +70,7 @@ def explain(simgap, recording, out, cpu_limit=CPU_LIMIT, options=("--jobs", "1")
             start_new_session=True,
             cwd=Path(out).parent,
         )
+        RUNNING.add(process.pid)
         used, peak, was_ended, pid = 0.0, 0.0, False, 0
         try:
             while not pid:
@@ -77,10 +84,11 @@ def explain(simgap, recording, out, cpu_limit=CPU_LIMIT, options=("--jobs", "1")
                 pid, status, usage = os.wait4(process.pid, os.WNOHANG)
             process.returncode = os.waitstatus_to_exitcode(status)
         finally:
+            RUNNING.discard(process.pid)
             if not pid:
                 os.killpg(process.pid, signal.SIGKILL)
         printed.seek(0)
-        message = printed.read()
+        output = printed.read()
     document = None if was_ended else _verdict(Path(out) / "verdict.json")
     return Outcome(
         document,
@@ -88,8 +96,20 @@ def explain(simgap, recording, out, cpu_limit=CPU_LIMIT, options=("--jobs", "1")
         max(used, usage.ru_utime + usage.ru_stime),
         wall,
         max(peak, usage.ru_maxrss / 1024),
-        "" if document else "\n".join(message.strip().splitlines()[-6:])[-1500:],
+        output,
     )
+
+
+def end_when_terminated():
+    """Make SIGTERM and Ctrl-C of this program end its running calls as well."""
+
+    def end(number, frame):
+        for group in RUNNING:
+            os.killpg(group, signal.SIGKILL)
+        os._exit(128 + number)
+
+    signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGINT, end)
 
 
 def _tree_usage(pid):
