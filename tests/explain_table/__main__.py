@@ -30,7 +30,6 @@ COLUMNS = (
 
 def main(arguments):
     given = _parser().parse_args(arguments)
-    explain_command.end_when_terminated()
     version = given.version or explain_command.version_of(given.simgap)
     recordings = tomllib.loads(RECORDINGS.read_text())
     chosen = {n: r for n, r in recordings.items() if not given.only or fnmatch(n, given.only)}
@@ -192,4 +191,5 @@ def totals(rows):
 
 
 if __name__ == "__main__":
+    explain_command.end_when_terminated()
     sys.exit(main(sys.argv[1:]))

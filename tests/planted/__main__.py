@@ -25,7 +25,6 @@ from tests.planted.robots import ROBOTS, MissingModelError
 
 def main(arguments):
     given = _parser().parse_args(arguments)
-    explain_command.end_when_terminated()
     if not given.simgap.is_file():
         print(f"{given.simgap}: no such command; expected bin/simgap of an installation (--simgap)")
         return 2
@@ -127,4 +126,5 @@ def _examine(questions, version, path, given):
 
 
 if __name__ == "__main__":
+    explain_command.end_when_terminated()
     sys.exit(main(sys.argv[1:]))

@@ -39,12 +39,15 @@ class _Comparison:
 
     def ratio(self, name):
         effect, _, place = name.partition("@")
-        if effect not in FORMS:
+        if effect not in EQUAL_FORMS:
             return None
         places = self._places(effect, place)
         if not places:
             return None
-        return min(self._held_out_error(form, places) for form in FORMS[effect]) / self.truth_error
+        return (
+            min(self._held_out_error(form, places) for form in EQUAL_FORMS[effect])
+            / self.truth_error
+        )
 
     def _places(self, effect, place):
         model = self.experiment.model
@@ -249,7 +252,7 @@ def _above_minus_one(model, place):
     return -0.95
 
 
-FORMS = {
+EQUAL_FORMS = {
     "drag.linear": [_planted("damping", "viscous", _stated("dof_damping"))],
     "friction.coulomb": [
         _planted("frictionloss", "torque", _stated("dof_frictionloss")),
