@@ -20,7 +20,7 @@ from tests.planted.motion import (
     Operator,
     Run,
     Simulator,
-    inertia_at,
+    mass_matrix,
     reference,
 )
 from tests.planted.robots import ROBOTS
@@ -298,7 +298,7 @@ class Experiment:
     @cached_property
     def nominal_inertia(self):
         """Diagonal (nv,) of the mass matrix at the pose, kg m^2 or kg."""
-        return inertia_at(self.model, self.pose)
+        return np.diag(mass_matrix(self.model, self.pose))
 
 
 class ObstructedMotionError(Exception):

@@ -180,7 +180,9 @@ class Operator:
         low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
         high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
         self.range = low, high
-        inertia = inertia_at(model, pose)[self.dofs]
+        # A joint's inertia while the other joints are free; with the larger inertia of locked
+        # joints the sampled loop would chatter.
+        inertia = 1 / np.diag(np.linalg.inv(mass_matrix(model, pose)))[self.dofs]
         self.kp = BANDWIDTH**2 * inertia + 2 * model.jnt_stiffness[joints]
         self.kv = 2 * DAMPING_RATIO * np.sqrt(self.kp * inertia)
 
@@ -213,11 +215,11 @@ class Operator:
         return Run(np.array(commands), positions, velocities)
 
 
-def inertia_at(model, pose):
-    """Diagonal (nv,) of the mass matrix at qpos, kg m^2 or kg."""
+def mass_matrix(model, pose):
+    """Mass matrix (nv, nv) at qpos."""
     data = mujoco.MjData(model)
     data.qpos[:] = pose
     mujoco.mj_forward(model, data)
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
-    return np.diag(mass)
+    return mass
