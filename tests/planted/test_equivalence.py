@@ -1,8 +1,9 @@
 """Other causes, refitted with plain MuJoCo."""
 
+import numpy as np
 import pytest
 
-from tests.planted.equivalence import EQUAL_FORMS, held_out_ratios
+from tests.planted.equivalence import FORMS, PLACES, held_out_ratios, levenberg_marquardt
 from tests.planted.items import KINDS
 from tests.planted.marking import EQUAL_RATIO
 from tests.planted.motion import EFFECTS
@@ -26,4 +27,24 @@ def test_a_twin_is_as_good_and_another_cause_is_not():
 
 
 def test_every_planted_kind_can_be_refitted():
-    assert {EFFECTS[kind] for kind in KINDS} <= EQUAL_FORMS.keys()
+    assert {EFFECTS[kind] for kind in KINDS} <= FORMS.keys()
+    assert FORMS.keys() == PLACES.keys()
+
+
+@pytest.mark.slow
+def test_a_law_with_the_planted_one_as_a_special_case_is_as_good():
+    item = drawn("pusher/frictionloss/0")
+    names = [f"{e}@{item.place}" for e in ("friction.stribeck", "friction.direction")]
+    stribeck, direction = held_out_ratios(item, names).values()
+    assert stribeck <= EQUAL_RATIO
+    assert direction > EQUAL_RATIO
+
+
+def test_the_fit_finds_a_minimum_at_a_bound():
+    def residual(x):
+        return np.array([x[0] - 3.0, 2 * x[1] + 4.0])
+
+    free = levenberg_marquardt(residual, np.zeros(2), np.full(2, -np.inf))
+    assert free == pytest.approx([3.0, -2.0], abs=1e-4)
+    bounded = levenberg_marquardt(residual, np.zeros(2), np.array([-np.inf, -0.5]))
+    assert bounded == pytest.approx([3.0, -0.5], abs=1e-4)
