@@ -6,6 +6,9 @@ import csv
 
 import numpy as np
 
+MIN_ITEMS = 100  # items of a complete test
+MIN_SHARE = 0.9  # share of fair answers
+MAX_MEDIAN_CPU = 5.0  # processor seconds of an answer at the median
 COLUMNS = (
     "item", "version", "place", "size", "gap", "outcome", "strict", "fair", "verdict", "causes",
     "number", "other_members", "cpu_s", "wall_s", "memory_mb", "heldout_base",
@@ -99,7 +102,9 @@ def text(rows):
         for row in rows:
             if row["version"] == version and row["drawn"]:
                 lines.append(_line(row))
-    lines += ["", _table(GROUP_COLUMNS, groups(rows))]
+    totals = groups(rows)
+    lines += ["", _table(GROUP_COLUMNS, totals), ""]
+    lines += [verdict(total) for total in totals if total["group"] == "all"]
     digests = {}
     for row in rows:
         digests.setdefault(row["item"], set()).add(row.get("digest"))
@@ -110,6 +115,17 @@ def text(rows):
     if undrawn:
         lines += ["", "no place shows such a change: " + ", ".join(undrawn)]
     return "\n".join(lines)
+
+
+def verdict(total):
+    """Whether a version reaches the marks, from its row of all items."""
+    share, seconds = total["fair"] / total["items"], float(total["cpu_median_s"])
+    is_reached = total["items"] >= MIN_ITEMS and share >= MIN_SHARE and seconds <= MAX_MEDIAN_CPU
+    return (
+        f"{total['version']}: {total['fair']} of {total['items']} right ({share:.0%}), median "
+        f"{seconds} s of processor time; expected {MIN_SHARE:.0%} of at least {MIN_ITEMS}, "
+        f"{MAX_MEDIAN_CPU:g} s: {'reached' if is_reached else 'not reached'}"
+    )
 
 
 def _line(row):
