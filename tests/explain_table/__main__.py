@@ -23,7 +23,7 @@ from tests.planted import explain_command
 RECORDINGS = Path(__file__).with_name("recordings.toml")
 SHARED = Path(__file__).parents[3] / "shared"
 COLUMNS = (
-    "item", "version", "verdict", "causes", "right", "faults", "cpu_s", "wall_s", "memory_mb",
+    "item", "version", "verdict", "causes", "right", "faults", "cpu_s", "cpu_asked", "wall_s", "memory_mb",
     "heldout_base", "heldout_extended", "noise_floor", "unit", "exit", "message",
 )  # fmt: skip
 
@@ -125,6 +125,7 @@ def measure(name, expected, shared, simgap, cpu_limit):
         "right": "" if wrong is None else "no" if wrong else "yes",
         "faults": expected.get("plain", "") if wrong is None else "; ".join(wrong),
         "cpu_s": f"{outcome.cpu:.1f}",
+        "cpu_asked": expected.get("cpu", ""),
         "wall_s": f"{outcome.wall:.1f}",
         "memory_mb": f"{outcome.memory:.0f}",
         "heldout_base": _number(held_out.get("rmse_base")),
