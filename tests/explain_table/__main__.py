@@ -23,8 +23,8 @@ from tests.planted import explain_command
 RECORDINGS = Path(__file__).with_name("recordings.toml")
 SHARED = Path(__file__).parents[3] / "shared"
 COLUMNS = (
-    "item", "version", "verdict", "causes", "right", "faults", "cpu_s", "cpu_asked", "wall_s", "memory_mb",
-    "heldout_base", "heldout_extended", "noise_floor", "unit", "exit", "message",
+    "item", "version", "verdict", "causes", "right", "faults", "cpu_s", "cpu_asked", "wall_s",
+    "memory_mb", "heldout_base", "heldout_extended", "noise_floor", "unit", "exit", "message",
 )  # fmt: skip
 
 
