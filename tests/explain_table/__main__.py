@@ -117,7 +117,7 @@ def measure(name, expected, shared, simgap, cpu_limit):
     wrong = faults(expected, outcome)
     verdict = outcome.verdict or {}
     held_out = verdict.get("heldout") or {}
-    message = outcome.output.strip().splitlines()[-1][:200] if outcome.output.strip() else ""
+    lines = outcome.output.replace(f"{shared}{os.sep}", "").strip().splitlines() or [""]
     return {
         "item": name,
         "verdict": verdict.get("verdict", "none"),
@@ -133,7 +133,7 @@ def measure(name, expected, shared, simgap, cpu_limit):
         "noise_floor": _number(held_out.get("noise_floor")),
         "unit": held_out.get("unit", ""),
         "exit": "limit" if outcome.code is None else outcome.code,
-        "message": message if outcome.verdict is None else "",
+        "message": lines[-1][:200] if outcome.verdict is None else "",
     }
 
 
