@@ -42,6 +42,7 @@ from bench.gap.prediction_error.selection import Regression
 from sims.base import Array
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
+from sims.simulated import Simulated
 from sims.system import Effect
 
 MANY_SHAPES = frozenset(
@@ -96,8 +97,8 @@ class PredictionErrorSearch(Search):
         watch.stage("selecting effects", 1)
         selected = identify(followed, columns)
         self.selections.append(selected)
-        softer = self._may_be_soft(selected)
-        best = self._confirmed(selected, self.base, plain=softer)
+        plain, softer = self._form_of_friction(selected)
+        best = self._confirmed(selected, self.base, plain)
         if softer and not self._is_explained(best) and self._is_softer(best):
             raise SoftFrictionError
         if not self._is_explained(best):
@@ -129,23 +130,36 @@ class PredictionErrorSearch(Search):
         other.close()
         return soft is not None
 
-    def _may_be_soft(self, selected: Selected) -> bool:
-        """Whether dry friction that was selected follows the data better in MuJoCo's soft form."""
+    def _form_of_friction(self, selected: Selected) -> tuple[bool, bool]:
+        """Whether dry friction without a state follows the data as well as what was selected, and
+        whether it does better in MuJoCo's soft form.
+
+        The force of friction is not linear in its limit where a joint sticks or creeps, so whole
+        models are followed.
+        """
         world = self.world
+        if not has_dry_friction(world, selected.effects):
+            return False, False
         robot: Any = world.kind
-        if not has_dry_friction(world, selected.effects) or robot.robot.friction_form == "soft":
-            return False
-        theta = self._plain_theta(self._start(selected.groups, selected.coefficients))
-        followed = self.follow()
-        motion = followed.trajectories()
+        start = self._start(selected.groups, selected.coefficients)
+        plain = self._plain_theta(start)
+        has_state = not np.array_equal(plain, start.theta)
+        is_soft = robot.robot.friction_form == "soft"
+        likelihood = self._likelihood(plain, world.kind)
+        softer = -np.inf if is_soft else self._likelihood(plain, soft_kind(world.kind))
+        own = self._likelihood(start.theta, world.kind) if has_state else -np.inf
+        best = max(likelihood, softer)
+        return best > own - 0.5 * SWITCH, softer > max(likelihood, own) + 0.5 * SWITCH
+
+    def _likelihood(self, theta: Array, kind: type[Simulated]) -> float:
+        """The log likelihood of the innovations with a simulator and its parameters."""
+        world, followed = self.world, self.follow()
         effects = [*world.library, *world.extra]
-        likelihoods = []
-        for kind in (world.kind, soft_kind(world.kind)):
-            simulator = kind(world.recording.constants, world.channels, effects=effects)
-            assert isinstance(simulator, RobotSimulator)
-            own = FollowedRuns.follow(world, theta, followed.noise, motion, simulator)
-            likelihoods.append(float(own.filtered.log_likelihood.sum()))
-        return 2.0 * (likelihoods[1] - likelihoods[0]) > SWITCH
+        simulator = kind(world.recording.constants, world.channels, effects=effects)
+        assert isinstance(simulator, RobotSimulator)
+        motion = followed.trajectories()
+        own = FollowedRuns.follow(world, theta, followed.noise, motion, simulator)
+        return float(own.filtered.log_likelihood.sum())
 
     def _plain_theta(self, start: Start) -> Array:
         """The parameters of a start with dry friction in place of laws with a state."""
