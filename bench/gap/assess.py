@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -124,8 +125,15 @@ class Assessor:
         numbers = self.numbers(search, finding.model)
         certain = [cause for cause in finding.causes if not cause.alternatives]
         places = [i for cause in certain for i in self.fitting.places(cause.effect)]
-        results = all(numbers[i].is_result for i in places)
+        results = all(numbers[i].is_result for i in places) and not self._ends_at_bound(numbers)
         return replace(finding, verdict=rules.verdict_of_numbers(finding.verdict, results))
+
+    def _ends_at_bound(self, numbers: Mapping[int, Number]) -> bool:
+        """Whether a base parameter of the extended model lies at a bound of its range: a cause may
+        then stand for a value beyond it.
+        """
+        fitted = [numbers[i] for i in self.fitting.base.tolist()]
+        return any(n.at_bound is not None and not n.is_result for n in fitted)
 
     def sigma(self, finding: Finding) -> Array:
         """(C,) the noise floor: stated, or what a model that leaves no structure leaves."""

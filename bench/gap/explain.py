@@ -27,6 +27,7 @@ from bench.gap.model.crew import Crew
 from bench.gap.model.floor import Floor, noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.watch import STAGES, Watch
+from bench.gap.model.widen import Bounds, fit_wider, outside, use_bounds
 from bench.gap.model.world import World
 from bench.gap.steps import Coarse, with_numerics
 from bench.gap.tell import Teller
@@ -190,6 +191,8 @@ class _Explainer:
         self.coarse: Coarse | None = None
         self.found: tuple[Search, Finding] | None = None
         self.faults: tuple[RecordingFault, ...] = ()
+        # By name the declared range of a base parameter and the wider one that it was given.
+        self.wider: dict[str, tuple[Bounds, Bounds]] = {}
         self._check()
 
     def _enter(self, kind: type[Simulated]) -> None:
@@ -257,7 +260,8 @@ class _Explainer:
         if self.coarse is not None:
             verdict = with_numerics(verdict, self.coarse)
         self.found = search, finding
-        story = Teller(self.assessor, search, base, finding, self.notes).story(verdict)
+        notes = (*outside(self.fitting, finding.model.fit.theta, self.wider), *self.notes)
+        story = Teller(self.assessor, search, base, finding, notes).story(verdict)
         return Explanation(verdict, story, self._extended(search, finding))
 
     def _finding(self, search: Search) -> Finding:
@@ -321,11 +325,24 @@ class _Explainer:
         if not self.watch.left():
             fault = wrong_units(self._units, self.fitting, self.noise, base)
             self.faults = (fault,) if fault is not None else ()
-        if self.faults or not self.kind.has_model:
+        if self.faults:
             return base
-        base = self._frozen(self._stepped(base))
+        if not self.kind.has_model:
+            return self._within_range(base)
+        base = self._frozen(self._within_range(self._stepped(base)))
         # What is asked about as a cause comes first: it would not be seen afterwards.
         return without_step(self.fitting, self.noise, base)
+
+    def _within_range(self, base: Base) -> Base:
+        """The base model with wider ranges for parameters that its fit leaves at a bound."""
+        declared = {p.name: p.bounds for p in self.fitting.parameters}
+        base, found = fit_wider(self.fitting, self.noise, base)
+        if self.measuring is not None:
+            use_bounds(self.measuring, found)
+        for parameter, (low, high) in found.items():
+            self.say(f"{parameter} ends at a bound of its range: widened to {low:g} to {high:g}")
+        self.wider = {one: (declared[one], bounds) for one, bounds in found.items()}
+        return base
 
     def _frozen(self, base: Base) -> Base:
         """The base model without free numbers of the robot that the data cannot fix.
