@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from bench.gap.causes.name import Finding
 from bench.gap.causes.score_test import tail
 from bench.gap.causes.search import Search
 from bench.gap.measure import Gain, gain, intervals
-from bench.gap.model.bounds import bound_of, coefficient_bounds
+from bench.gap.model.bounds import bound_of, coefficient_bounds, is_unusual
 from bench.gap.model.floor import Floor
 from bench.gap.model.models import Model, Names
 from bench.gap.model.time_scale import is_instant
@@ -25,6 +26,7 @@ from bench.problem.seeds import rng_for
 from sims.base import Array
 from sims.extended import Number
 from sims.recording.recording import Recording
+from sims.system import Effect
 
 WORST = -9.0
 """A candidate's share of the held-out gap is cut here: it has made things worse, by whatever."""
@@ -109,8 +111,52 @@ class Assessor:
             # JSON has no number for what is not known; at a bound the curvature says nothing.
             bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
             ends = (low, high) if bounded else (None, None)
-            result[place] = Number(value, parameter.unit, ends[0], ends[1], at_bound)
-        return result
+            usual = self._usual(place) if place in fitted else parameter.bounds
+            unusual = usual if not is_instant(parameter) and is_unusual(value, *usual) else None
+            unit = parameter.unit
+            low_end, high_end = ends
+            result[place] = Number(value, unit, low_end, high_end, at_bound, usual_range=unusual)
+        return self._with_totals(model, result)
+
+    def _usual(self, place: int) -> tuple[float, float]:
+        """The plausible range of a number: of a robot's free number narrower than its bounds."""
+        parameter = self.fitting.parameters[place]
+        free = self.fitting.kind.has_model and place in self.fitting.base
+        return parameter.training or parameter.bounds if free else parameter.bounds
+
+    def _with_totals(self, model: Model, numbers: dict[int, Number]) -> dict[int, Number]:
+        """The numbers of a robot with what becomes of those that its model file states."""
+        kind: Any = self.fitting.kind
+        if not kind.has_model:
+            return numbers
+        # Loaded where there is a robot alone.
+        from sims.robot.totals import totals
+
+        for effect, places in self._placed(model):
+            values = [numbers[place].value for place in places]
+            for place, found in zip(places, totals(kind.robot, effect, values), strict=True):
+                if found is not None and any(values):
+                    unit = found.unit if found.unit != numbers[place].unit else ""
+                    numbers[place] = replace(
+                        numbers[place], stated=found.stated, total=found.total, total_unit=unit
+                    )
+        return numbers
+
+    def _placed(self, model: Model) -> Iterator[tuple[type[Effect], list[int]]]:
+        """The effects at one place each that were fitted, with the places of their numbers."""
+        world, kind = self.fitting, cast(Any, self.fitting.kind)
+        # The user's free numbers come first, in the order of their effects.
+        places = iter(range(world.own))
+        for effect in kind.system.freed_effects:
+            yield effect, [next(places) for _ in effect.coefficients]
+        for name in model.names:
+            effect = world.effects[name]
+            members = getattr(effect, "members", ()) or (effect,)
+            places = iter(world.places(name))
+            # A family with one number for all places changes no number of the file.
+            if sum(len(member.coefficients) for member in members) == len(world.places(name)):
+                for member in members:
+                    yield type(member), [next(places) for _ in member.coefficients]
 
     def _ranges(self, model: Model) -> dict[int, tuple[float, float]]:
         """Where the fit of a model could move each number, by its place."""
@@ -148,7 +194,12 @@ class Assessor:
         effect = world.effects[evidence.effect]
         coefficients = effect.on(world.simulator.system)
         places = range(*world.slots[evidence.effect].indices(len(world.parameters)))
-        by_name = {c.name: numbers[i] for c, i in zip(coefficients, places, strict=True)}
+        # A coefficient that cannot be observed is fixed at zero, and is no finding.
+        by_name = {
+            c.name: numbers[i]
+            for c, i in zip(coefficients, places, strict=True)
+            if c.least is None or c.least != c.most
+        }
         return Cause(evidence.effect, evidence.alternatives, effect.says, by_name, evidence.p_value)
 
     def _counted(self) -> list[int]:

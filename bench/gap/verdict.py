@@ -288,15 +288,28 @@ def finite(value: float) -> float | None:
 
 def _estimates(numbers: Mapping[str, Number]) -> Document:
     """Numbers as in verdict.json, by name."""
-    return {
-        name: {"value": n.value, "unit": n.unit, "low": n.low, "high": n.high}
-        | ({"at_bound": n.at_bound} if n.at_bound is not None else {})
-        for name, n in numbers.items()
-    }
+    return {name: _estimate(number) for name, number in numbers.items()}
+
+
+def _estimate(number: Number) -> Document:
+    found: Document = {key: getattr(number, key) for key in ("value", "unit", "low", "high")}
+    # What says nothing of a number is left out.
+    for key in ("at_bound", "stated", "total", "total_unit"):
+        if (value := getattr(number, key)) not in (None, ""):
+            found[key] = value
+    if number.usual_range is not None:
+        found["usual_range"] = list(number.usual_range)
+    return found
 
 
 def _numbers(document: Mapping[str, Any]) -> dict[str, Number]:
-    return {name: Number(**estimate) for name, estimate in document.items()}
+    return {name: _number(estimate) for name, estimate in document.items()}
+
+
+def _number(estimate: Mapping[str, Any]) -> Number:
+    usual = estimate.get("usual_range")
+    ends = (float(usual[0]), float(usual[1])) if usual is not None else None
+    return Number(**{**estimate, "usual_range": ends})
 
 
 def _short(number: Number) -> str:

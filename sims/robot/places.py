@@ -280,6 +280,8 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
         low = least = min(0.0 - stated, 0.0)
     if effect.name == "mass.offset":
         least, most = spot.offsets[c.name]
+        if least < most:
+            low, high = max(low, least), min(high, most)
     return replace(c, units=(unit,) * 3, plausible=((low, high),) * 3, least=least, most=most)
 
 

@@ -55,9 +55,8 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
     ]
 
 
-def is_unusual(value: float, parameter: Parameter) -> bool:
-    """Whether a fitted coefficient lies outside its plausible range, by more than rounding."""
-    low, high = parameter.bounds
+def is_unusual(value: float, low: float, high: float) -> bool:
+    """Whether a fitted number lies outside its plausible range, by more than rounding."""
     near = AT_BOUND * (high - low)
     return not low - near <= value <= high + near
 
