@@ -24,8 +24,9 @@ from bench.gap.freeze import frozen
 from bench.gap.held_out import HeldOutRuns
 from bench.gap.model.base_fit import Base, fit_base, without_step
 from bench.gap.model.crew import Crew
-from bench.gap.model.floor import Floor, noise_floor
+from bench.gap.model.floor import PRECISION, Floor, noise_floor
 from bench.gap.model.noise import Noise
+from bench.gap.model.noise_free import add_least_noise
 from bench.gap.model.watch import STAGES, Watch
 from bench.gap.model.widen import Bounds, fit_wider, outside, use_bounds
 from bench.gap.model.world import World
@@ -33,6 +34,7 @@ from bench.gap.steps import Coarse, with_numerics
 from bench.gap.tell import Teller
 from bench.gap.unit_check import Subject, recognised, wrong_units
 from bench.gap.verdict import RecordingFault
+from bench.pages.text import joined
 from bench.problem.seeds import rng_for
 from bench.recordings.joined import load_all
 from bench.recordings.pieces import cut
@@ -101,6 +103,16 @@ def explain(
         explainer = _Explainer(subject, *given, watch or Watch(), crew, thorough)
         with closing(explainer):
             return explainer.run()
+
+
+def _added_noise(channels: Sequence[str]) -> str:
+    """What is to be said of channels to which noise was added; empty where there are none."""
+    if not channels:
+        return ""
+    return (
+        f"no noise is found in {joined(channels)}: white noise of {PRECISION:g} of the range is "
+        "added, the accuracy of a simulation; smaller differences are not explained"
+    )
 
 
 class Proposed(NamedTuple):
@@ -179,7 +191,10 @@ class _Explainer:
         for odd in refuse_odd(self.recording, kind, force):
             say(f"{self.path}: {odd}")
         self.recording, note = cut(self.recording, kind, subject.pieces, subject.whole)
-        self.notes = (note,) if note else ()
+        recorded = self.recording.runs[0].channels
+        names = [channel.name for channel in kind.channels if channel.name in recorded]
+        self.recording, quiet = add_least_noise(self.recording, names)
+        self.notes = tuple(text for text in (note, _added_noise(quiet)) if text)
         for note in self.notes:
             say(note)
         check_recording(self.recording, kind(engine=self.engine), force)
