@@ -26,6 +26,7 @@ from bench.problem.seeds import rng_for
 from sims.base import Array
 from sims.extended import Number
 from sims.recording.recording import Recording
+from sims.robot.causes import GRAVITY_COMPENSATED, is_gravity_compensated
 from sims.system import Effect
 
 WORST = -9.0
@@ -135,7 +136,10 @@ class Assessor:
         for effect, places in self._placed(model):
             values = [numbers[place].value for place in places]
             for place, found in zip(places, totals(kind.robot, effect, values), strict=True):
-                if found is not None and any(values):
+                name, number = effect.name, numbers[place]
+                # The model file keeps its gravity where bodies are compensated.
+                keeps = is_gravity_compensated(name, {name: number})
+                if found is not None and any(values) and not keeps:
                     unit = found.unit if found.unit != numbers[place].unit else ""
                     numbers[place] = replace(
                         numbers[place], stated=found.stated, total=found.total, total_unit=unit
@@ -200,7 +204,10 @@ class Assessor:
             for c, i in zip(coefficients, places, strict=True)
             if c.least is None or c.least != c.most
         }
-        return Cause(evidence.effect, evidence.alternatives, effect.says, by_name, evidence.p_value)
+        says = effect.says
+        if world.kind.has_model and is_gravity_compensated(evidence.effect, by_name):
+            says = GRAVITY_COMPENSATED
+        return Cause(evidence.effect, evidence.alternatives, says, by_name, evidence.p_value)
 
     def _counted(self) -> list[int]:
         """Channels that share the unit of the one that sensor effects act on."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap.causes.rules import CUT, FAULTY, MEANING, OPEN, VerdictName
+from bench.gap.causes.rules import BORDERING, CUT, FAULTY, MEANING, OPEN, VerdictName
 from bench.gap.model.watch import Cut
 from bench.gap.propose import Experiment
 from sims.extended import Number
@@ -225,12 +225,22 @@ class Verdict:
             return FAULTY
         if self.cut is None and self.has_open_numbers:
             return OPEN
+        if self.cut is None and self.bordering:
+            return BORDERING
         return MEANING[self.verdict] if self.cut is None else CUT[self.verdict]
 
     @property
     def has_open_numbers(self) -> bool:
         """Whether the verdict is `partial` and a number of a cause is not a result."""
         return self.verdict == "partial" and any(cause.open_numbers for cause in self.causes)
+
+    @property
+    def bordering(self) -> dict[str, Number]:
+        """Base parameters at a bound of their range, where that makes the verdict `partial`."""
+        if self.verdict != "partial" or not self.causes:
+            return {}
+        numbers = self.parameters.items()
+        return {k: n for k, n in numbers if n.at_bound is not None and not n.is_result}
 
     def document(self) -> Document:
         """The content of verdict.json."""

@@ -21,6 +21,22 @@ _AXES: Mapping[str, tuple[str, ...]] = {
 """Coefficients of effects that have several, in their order."""
 
 
+COMPENSATED = 0.02
+"""Share of its weight that a robot with compensated gravity still feels at most."""
+
+GRAVITY_COMPENSATED = "gravity is compensated: the real robot or its controller carries its weight"
+"""What is said of a correction of gravity that takes all of it away."""
+
+
+def is_gravity_compensated(effect: str, numbers: Mapping[str, Number]) -> bool:
+    """Whether a correction of gravity takes all of it away: the real robot, or its controller,
+    carries its own weight.
+    """
+    return effect == "gravity.scale" and any(
+        abs(1.0 + number.value) < COMPENSATED for number in numbers.values()
+    )
+
+
 @dataclass(frozen=True)
 class Cause:
     """An effect at one place, with its numbers.

@@ -139,6 +139,14 @@ def headline(story: Story) -> str:
         return f"The simulation {lacks(causes)}: these data cannot tell which."
     if verdict == "partial" and (open_ones := [c for c in causes if c.open_numbers]):
         return f"The simulation {lacks(causes)}, but {_undetermined(open_ones)}."
+    if bordering := story.verdict.bordering:
+        (name, first), *_ = bordering.items()
+        end = f"the {END[first.at_bound or 'high']} bound of its range"
+        value = with_unit(number(first.value), first.unit)
+        why = f"parameter {clean(name, 60)} ends at {end}, {value}"
+        return (
+            f"The simulation {lacks(causes)}, but {why}: the cause may stand for a value beyond it."
+        )
     if verdict == "partial":
         more = "something else that no known cause explains"
         if len(causes) == 1 and (said := sized(causes[0])):

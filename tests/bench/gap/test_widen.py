@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from bench.cli import main
+from bench.gap.causes.rules import BORDERING
 from bench.gap.explain import explain
 from bench.gap.model.base_fit import fit_base
 from bench.gap.model.noise import Noise
 from bench.gap.model.widen import fit_wider, widened
-from bench.gap.report.account import account
+from bench.gap.report.account import account, headline
 from sims.base import Parameter
 from tests.bench.gap.made import recording, world
 
@@ -46,9 +47,13 @@ def test_a_parameter_at_a_bound_that_physics_sets_keeps_a_cause_from_being_named
     path = tmp_path / "ball.csv"
     words = ["--theta", "restitution=1.0", "--noise", "0.002", "--effect", "drag.linear=0.1"]
     assert main(["simulate", "ball", "--out", str(path), "--seconds", "1", *words]) == 0
-    answer = explain(path).answer
-    print(answer, answer.parameters)
-    assert answer.verdict != "named"
+    found = explain(path)
+    answer = found.answer
+    assert answer.verdict == "partial"
+    assert [cause.effect for cause in answer.causes] == ["drag.linear"]
+    assert answer.parameters["restitution"].at_bound == "high"
+    assert answer.says == BORDERING
+    assert "parameter restitution ends at the upper bound of its range, 1:" in headline(found.story)
 
 
 def test_within_its_range_nothing_is_widened():
