@@ -133,17 +133,18 @@ class Assessor:
         # Loaded where there is a robot alone.
         from sims.robot.totals import totals
 
-        for effect, places in self._placed(model):
-            values = [numbers[place].value for place in places]
-            for place, found in zip(places, totals(kind.robot, effect, values), strict=True):
-                name, number = effect.name, numbers[place]
-                # The model file keeps its gravity where bodies are compensated.
-                keeps = is_gravity_compensated(name, {name: number})
-                if found is not None and any(values) and not keeps:
-                    unit = found.unit if found.unit != numbers[place].unit else ""
-                    numbers[place] = replace(
-                        numbers[place], stated=found.stated, total=found.total, total_unit=unit
-                    )
+        placed = list(self._placed(model))
+        fitted = [(effect, [numbers[i].value for i in places]) for effect, places in placed]
+        for (effect, places), made in zip(placed, totals(kind.robot, fitted), strict=True):
+            # The model file keeps its gravity where bodies are compensated.
+            keeps = is_gravity_compensated(effect.name, {"": numbers[places[0]]})
+            if keeps or not any(numbers[i].value for i in places):
+                continue
+            for i, found in zip(places, made, strict=True):
+                if found is not None:
+                    unit = found.unit if found.unit != numbers[i].unit else ""
+                    stated, total = found.stated, found.total
+                    numbers[i] = replace(numbers[i], stated=stated, total=total, total_unit=unit)
         return numbers
 
     def _placed(self, model: Model) -> Iterator[tuple[type[Effect], list[int]]]:
@@ -171,12 +172,41 @@ class Assessor:
         return ranges
 
     def judged(self, search: Search, finding: Finding) -> Finding:
-        """The finding with the verdict that its numbers allow."""
+        """The finding with the verdict that its numbers and the fitted models allow."""
+        if finding.verdict == "unknown" and self._refutes(search, finding):
+            return replace(finding, verdict="adequate")
         numbers = self.numbers(search, finding.model)
         certain = [cause for cause in finding.causes if not cause.alternatives]
         places = [i for cause in certain for i in self.fitting.places(cause.effect)]
         results = all(numbers[i].is_result for i in places) and not self._ends_at_bound(numbers)
         return replace(finding, verdict=rules.verdict_of_numbers(finding.verdict, results))
+
+    def _refutes(self, search: Search, finding: Finding) -> bool:
+        """Whether a linear score is all that speaks for something missing, and no fitted model with
+        it explains the data better, or none predicts the held-out runs better. In closed loops and
+        at rest, derivatives may promise what no fit delivers.
+        """
+        if finding.causes or finding.remains.structure or finding.cut is not None:
+            return False
+        tried = [model for model in search.models.values() if model.names]
+        better = [model.names for model in tried if model.merit > search.base.merit]
+        held_out = finding.measured or {}
+        excess = self._held_out_excess(finding)
+        if not tried or (excess is not None and rules.is_missed(excess, excess)):
+            return False
+        return not any(
+            names not in held_out or held_out[names].merit > held_out[()].merit for names in better
+        )
+
+    def _held_out_excess(self, finding: Finding) -> float | None:
+        """RMS of what the base model leaves of held-out runs in units of the noise, less one; None
+        where none were simulated.
+        """
+        runs, measured = self.measuring, finding.measured
+        if runs is None or measured is None or () not in measured:
+            return None
+        left = (runs.observed - measured[()].simulated) / self.floor.sigma
+        return float(np.sqrt(np.square(left[np.isfinite(runs.observed)]).mean())) - 1.0
 
     def _ends_at_bound(self, numbers: Mapping[int, Number]) -> bool:
         """Whether a base parameter of the extended model lies at a bound of its range: a cause may

@@ -5,7 +5,7 @@ the coefficient in it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -80,25 +80,38 @@ _TOTALS: Mapping[str, Reading] = {
 }
 
 
-def totals(robot: Robot, effect: type[Effect], values: Sequence[float]) -> list[Total | None]:
-    """Return what becomes of the numbers of the model file, by coefficient of an effect at one
-    place; None where the file states no such number.
+Fitted = Sequence[tuple[type[Effect], Sequence[float]]]
+"""Effects at one place each, or of the world, with their coefficients."""
 
-    Args:
-        robot: the robot of the model file.
-        effect: at a joint, an actuator, a body, or one of the world's.
-        values: its coefficients.
+
+def totals(robot: Robot, fitted: Fitted) -> list[list[Total | None]]:
+    """Return what becomes of the numbers of the model file when all effects are in it, by effect
+    and coefficient; None where the file states no such number.
+
+    The mass and the inertia of one body may both be wrong: a total has what all effects make of it.
     """
-    name = effect.of or effect.name
-    if name not in _TOTALS:
-        return [None] * len(values)
-    reading = _TOTALS[name]
-    now: Any = fields(robot.compiled)
-    stated = np.array(reading.read(now, robot, effect.place), dtype=float)
-    FIELDS[name].write(now, robot, effect.place, np.array(values, dtype=float)[:, None])
-    after = np.array(reading.read(now, robot, effect.place), dtype=float)
+    stated, after = fields(robot.compiled), fields(robot.compiled)
+    for effect, values in fitted:
+        if _name(effect) in _TOTALS:
+            c = np.array(values, dtype=float)[:, None]
+            FIELDS[_name(effect)].write(after, robot, effect.place, c)
+    return [_totals(robot, effect, len(values), stated, after) for effect, values in fitted]
+
+
+def _name(effect: type[Effect]) -> str:
+    return effect.of or effect.name
+
+
+def _totals(
+    robot: Robot, effect: type[Effect], count: int, stated: Fields, after: Fields
+) -> list[Total | None]:
+    """The totals of one effect."""
+    if _name(effect) not in _TOTALS:
+        return [None] * count
+    reading = _TOTALS[_name(effect)]
     found: list[Total | None] = []
-    for c, before, total in zip(effect.coefficients, stated, after, strict=True):
+    pairs = (np.array(reading.read(f, robot, effect.place), dtype=float) for f in (stated, after))
+    for c, before, total in zip(effect.coefficients, *pairs, strict=True):
         unit = (reading.slide if _slides(robot, effect) else "") or reading.hinge or c.units[0]
         known = np.isfinite([before, total]).all()
         found.append(Total(float(before), float(total), unit or "1") if known else None)

@@ -139,7 +139,7 @@ def outside(world: World, theta: Array, wider: Mapping[str, tuple[Bounds, Bounds
             continue
         unit = "" if parameter.unit == "1" else f" {parameter.unit}"
         sentences.append(
-            f"{parameter.name} = {value:.4g}{unit} lies outside its declared range, {low:g} to "
+            f"{parameter.name} = {value:.4g}{unit} lies outside its usual range, {low:g} to "
             f"{high:g}{unit}; the range was widened to {wide_low:g} to {wide_high:g}{unit}. "
             "Check the units and constants of the recording"
         )

@@ -493,7 +493,8 @@ def moves(story: Story, p: Tuned) -> str:
         nominal = f"its nominal {number(p.before[0])}{unit}"
         return f"{name} is not touched by these data and stays at {nominal}."
     if not story.verdict.causes:
-        return f"{name} = {tuned(p, 0)}."
+        # Nothing was found: the last fit is of the base model, too, and the best one.
+        return f"{name} = {tuned(p, 1)}."
     before, after = tuned(p, 0), tuned(p, 1)
     end = ": it had absorbed part of the gap." if absorbed(p) else "."
     return f"{name} {before} before, {after} after ({shift(p)}){end}"
@@ -502,9 +503,10 @@ def moves(story: Story, p: Tuned) -> str:
 def tuned(p: Tuned, when: int) -> str:
     """A parameter's estimate before (0) or after (1), with its interval or the bound it lies at."""
     value, bound = (p.before, p.after)[when], p.bounds[when]
+    total = p.in_file if when else ""
     if bound is not None:
-        return at_bound(value[0], p.unit, bound)
-    return with_unit(estimate(*value), p.unit)
+        return at_bound(value[0], p.unit, bound) + total
+    return with_unit(estimate(*value), p.unit) + total
 
 
 def shift(p: Tuned) -> str:

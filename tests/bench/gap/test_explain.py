@@ -327,7 +327,7 @@ def test_a_mass_beyond_its_declared_range_is_fitted_and_told(tmp_path):
     assert mass.value == pytest.approx(95.0, rel=5e-3)
     assert mass.low < mass.value < mass.high
     (said,) = found.story.remains
-    assert "lies outside its declared range, " in said
+    assert "lies outside its usual range, " in said
     assert "to 10 kg" in said
 
 

@@ -39,7 +39,7 @@ def test_an_inertia_beyond_its_range_is_fitted_and_no_cause_is_named(heavy):
     assert inertia.value == pytest.approx(0.01 * HEAVIER, rel=2e-3)
     assert inertia.low < inertia.value < inertia.high
     said = " ".join(" ".join(account(found.story)).split())
-    assert "lies outside its declared range, 0.001 to 0.01 kg*m^2" in said
+    assert "lies outside its usual range, 0.001 to 0.01 kg*m^2" in said
 
 
 def test_a_parameter_at_a_bound_that_physics_sets_keeps_a_cause_from_being_named(tmp_path):

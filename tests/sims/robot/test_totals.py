@@ -53,7 +53,7 @@ def system(tmp_path_factory):
     ],
 )
 def test_stated_and_total(system, effect, values, expected):
-    found = totals(system.robot, system.effect(effect), values)
+    (found,) = totals(system.robot, [(system.effect(effect), values)])
     for one, (stated, total, unit) in zip(found, expected, strict=True):
         assert (one.stated, one.total) == pytest.approx((stated, total))
         assert one.unit == unit
@@ -61,16 +61,21 @@ def test_stated_and_total(system, effect, values, expected):
 
 @pytest.mark.parametrize("effect", ["sensor.bias@q.elbow", "input.delay@m_elbow"])
 def test_what_the_file_does_not_state_has_no_total(system, effect):
-    assert totals(system.robot, system.effect(effect), [0.1]) == [None]
+    assert totals(system.robot, [(system.effect(effect), [0.1])]) == [[None]]
 
 
 def test_an_actuator_without_limit_has_no_total(system):
-    assert totals(system.robot, system.effect("actuator.limit@m_lift"), [1.0]) == [None]
+    assert totals(system.robot, [(system.effect("actuator.limit@m_lift"), [1.0])]) == [[None]]
 
 
 def test_the_total_is_what_the_extended_file_compiles_to(system):
-    ((one,),) = (totals(system.robot, system.effect("mass.scale@fore"), [0.25]),)
-    causes = {"mass.scale@fore": {"coefficient": Number(0.25, "1", 0.2, 0.3)}}
+    names = {"mass.scale@fore": 0.25, "inertia.scale@fore": -0.3}
+    fitted = [(system.effect(name), [value]) for name, value in names.items()]
+    ((mass,), (inertia,)) = totals(system.robot, fitted)
+    causes = {n: {"coefficient": Number(value, "1", 0.2, 0.3)} for n, value in names.items()}
     model = apply(system.robot, causes).model
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "fore")
-    assert np.isclose(model.body_mass[number], one.total)
+    assert np.isclose(model.body_mass[number], mass.total)
+    # A larger mass has a larger inertia: the file states what both make of it.
+    assert np.isclose(model.body_inertia[number].max(), inertia.total)
+    assert np.isclose(inertia.total, 0.009 * 1.25 * 0.7)
