@@ -126,6 +126,9 @@ def test_a_link_without_inertia_does_not_shrink_the_ranges_of_its_joint(yaw, tmp
     system = robot_simulator(yaw).system
     ((low, high),) = system.effect("inertia.armature@roll").coefficients[0].plausible[:1]
     assert (low, high > 1e-4) == (0.0, True)
+    # Set free, too: within 1e-8 kg m^2 it could only end at a bound.
+    (free,) = robot_simulator(yaw, ["armature@roll"]).system.parameters
+    assert free.bounds[1] > 4e-4
 
 
 def test_bounds_far_apart_are_not_met_by_numbers_near_zero():
