@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 
 from bench.gap.assess import Assessor
-from bench.gap.causes import rules
 from bench.gap.causes.name import Finding, name
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import probes, remains
@@ -34,7 +33,13 @@ from bench.gap.model.problem import Start
 from bench.gap.model.watch import STAGES, Watch
 from bench.gap.model.widen import Bounds, fit_wider, outside, use_bounds
 from bench.gap.model.world import World
-from bench.gap.steps import Coarse, Reusable, is_finer_step_better, with_numerics
+from bench.gap.steps import (
+    Coarse,
+    Reusable,
+    is_finer_model_better,
+    is_finer_step_better,
+    with_numerics,
+)
 from bench.gap.tell import Teller
 from bench.gap.unit_check import Subject, recognised, wrong_units
 from bench.gap.verdict import RecordingFault
@@ -456,20 +461,20 @@ class _Explainer:
         this answer or with some of them; None where this step stands.
 
         A missing effect can make either step look better, and effects can imitate a step, so the
-        first choice is preliminary. Models are compared by their merit (Schwarz's criterion), and
-        a finer step needs a clearly larger one: data that MuJoCo made with the file's own step must
+        first choice is preliminary. Models are compared by merit and residual, and a finer step
+        must be clearly better: data that MuJoCo made with the file's own step must
         not be explained by another.
         """
         if self.finer is None or self.faults or finding.cut is not None or self.watch.left():
             return None
         if not finding.causes and (self.coarse is not None or finding.verdict == "adequate"):
             return None
-        merit = finding.model.merit
+        found = finding.model.merit, search.excess(finding.model)
         here = _Worlds(self.kind, self.fitting, self.measuring)
         if self.coarse is not None:
             before = self.assessor.before
             self._return(self.file)
-            if rules.is_alike(merit - self._best_merit(search, finding)):
+            if not is_finer_model_better(self._best(search, finding), found):
                 self.say("the model file's own step explains the data as well: it is used")
                 self.coarse = None
                 base = Base(search.base.fit, search.frozen)
@@ -480,18 +485,18 @@ class _Explainer:
         if fine is None:
             return None
         self._enter(fine.kind)
-        gain = self._best_merit(search, finding) - merit
-        if rules.is_alike(gain):
+        best = self._best(search, finding)
+        if not is_finer_model_better(found, best):
             self._return(here)
             return None
         base = Base(search.base.fit, search.frozen)
         other = fit_base(self.fitting, self.noise, self._nearby(base))
-        self._use_finer(fine, gain, base, here)
+        self._use_finer(fine, best[0] - found[0], base, here)
         return self._answered(other)
 
-    def _best_merit(self, search: Search, finding: Finding) -> float:
-        """The largest merit of models with some or all effects of a finding, fitted with the step
-        of the present worlds.
+    def _best(self, search: Search, finding: Finding) -> tuple[float, float]:
+        """Merit and excess over the noise of the best model with some or all effects of a finding,
+        fitted with the step of the present worlds.
         """
         names, fit = finding.model.names, finding.model.fit
         slots = self.fitting.slots
@@ -504,7 +509,8 @@ class _Explainer:
                 starts.append(Start(some, theta, fit.states))
         fits = Fitter(self.fitting, self.noise, search.frozen).fit(starts, STEPS)
         models = self._search(Base(search.base.fit, search.frozen), self._rng())
-        return max(models.enter(one).merit for one in fits)
+        best = max((models.enter(one) for one in fits), key=lambda model: model.merit)
+        return best.merit, models.excess(best)
 
     def _nearby(self, base: Base) -> Array | None:
         """Where a fit of finer steps begins: a step moves the best parameters a little, and its

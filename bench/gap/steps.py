@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from bench.gap.causes.rules import VerdictName
+from bench.gap.causes.rules import VerdictName, helps, is_alike
 from bench.gap.verdict import Cause, Verdict
 from sims.extended import Number
 
@@ -59,6 +59,19 @@ def is_finer_step_better(gain: float, gap: float, left: float) -> bool:
         left: the same with the finer step.
     """
     return gain >= SURE and gap - max(left, 0.0) >= PART * gap
+
+
+def is_finer_model_better(file: tuple[float, float], finer: tuple[float, float]) -> bool:
+    """Whether a model with a finer step is better beyond doubt than one with the file's own.
+
+    Args:
+        file: merit (Schwarz's criterion, twice the log likelihood less log n for each number) of
+            the model with the file's step, and what it leaves over the noise, RMS in its units.
+        finer: the same with the finer step. Far from the noise the likelihood is misled by
+            autocorrelated residuals, so the residual must be smaller, too.
+    """
+    merits, excesses = zip(file, finer, strict=True)
+    return not is_alike(merits[1] - merits[0]) and helps(merits, excesses)
 
 
 class Coarse(NamedTuple):

@@ -10,7 +10,7 @@ from bench.gap.explain import _Explainer, _Subject, explain
 from bench.gap.model.base_fit import fit_base
 from bench.gap.model.crew import Crew
 from bench.gap.model.watch import Watch
-from bench.gap.steps import SURE, Reusable, is_finer_step_better
+from bench.gap.steps import SURE, Reusable, is_finer_model_better, is_finer_step_better
 
 ARM = """<mujoco>
   <compiler angle="radian" autolimits="true"/>
@@ -108,6 +108,21 @@ def test_a_step_that_is_the_only_thing_wrong_is_found_before_any_cause(tmp_path)
 )
 def test_when_a_finer_step_is_used_in_the_search(gain, gap, left, better):
     assert is_finer_step_better(gain, gap, left) is better
+
+
+@pytest.mark.parametrize(
+    ("file", "finer", "better"),
+    [
+        ((24327.0, -0.02), (24346.0, -0.02), True),
+        ((24327.0, -0.02), (24333.0, -0.02), False),
+        # The likelihood is larger and so is the residual: neither model is near the data.
+        ((1903.0, 2.2), (2030.0, 3.4), False),
+        ((1903.0, 2.2), (2030.0, 0.1), True),
+        ((2030.0, -0.01), (1500.0, 6.0), False),
+    ],
+)
+def test_when_a_finer_step_is_better_once_causes_are_known(file, finer, better):
+    assert is_finer_model_better(file, finer) is better
 
 
 def test_steps_are_simulated_once_and_only_as_far_as_needed():
