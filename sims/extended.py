@@ -63,6 +63,11 @@ class Number:
         low, high: the 95 % interval.
         at_bound: which end of its range the estimate lies at; None where it lies inside. At a bound
             there is no interval.
+        stated: the number of the robot's model file that the estimate changes; None where the file
+            has no such number.
+        total: the same with the estimate in it.
+        total_unit: unit of `stated` and `total`; empty where it is `unit`.
+        usual_range: the range in which one expects the estimate; None where it lies inside.
     """
 
     value: float
@@ -70,6 +75,10 @@ class Number:
     low: float | None
     high: float | None
     at_bound: Literal["low", "high"] | None = None
+    stated: float | None = None
+    total: float | None = None
+    total_unit: str = ""
+    usual_range: tuple[float, float] | None = None
 
     @property
     def is_result(self) -> bool:

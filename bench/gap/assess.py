@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 
@@ -14,7 +16,7 @@ from bench.gap.causes.score_test import tail
 from bench.gap.causes.search import Search
 from bench.gap.friction_form import form_of, with_solver_parameters
 from bench.gap.measure import Gain, gain, intervals
-from bench.gap.model.bounds import bound_of, coefficient_bounds
+from bench.gap.model.bounds import bound_of, coefficient_bounds, is_unusual
 from bench.gap.model.floor import Floor
 from bench.gap.model.models import Model, Names
 from bench.gap.model.time_scale import is_instant
@@ -25,6 +27,8 @@ from bench.problem.seeds import rng_for
 from sims.base import Array
 from sims.extended import Number
 from sims.recording.recording import Recording
+from sims.robot.causes import GRAVITY_COMPENSATED, is_gravity_compensated
+from sims.system import Effect
 
 WORST = -9.0
 """A candidate's share of the held-out gap is cut here: it has made things worse, by whatever."""
@@ -109,8 +113,56 @@ class Assessor:
             # JSON has no number for what is not known; at a bound the curvature says nothing.
             bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
             ends = (low, high) if bounded else (None, None)
-            result[place] = Number(value, parameter.unit, ends[0], ends[1], at_bound)
-        return result
+            usual = self._usual(place) if place in fitted else parameter.bounds
+            unusual = usual if not is_instant(parameter) and is_unusual(value, *usual) else None
+            unit = parameter.unit
+            low_end, high_end = ends
+            result[place] = Number(value, unit, low_end, high_end, at_bound, usual_range=unusual)
+        return self._with_totals(model, result)
+
+    def _usual(self, place: int) -> tuple[float, float]:
+        """The plausible range of a number: of a robot's free number narrower than its bounds."""
+        parameter = self.fitting.parameters[place]
+        free = self.fitting.kind.has_model and place in self.fitting.base
+        return parameter.training or parameter.bounds if free else parameter.bounds
+
+    def _with_totals(self, model: Model, numbers: dict[int, Number]) -> dict[int, Number]:
+        """The numbers of a robot with what becomes of those that its model file states."""
+        kind: Any = self.fitting.kind
+        if not kind.has_model:
+            return numbers
+        # Loaded where there is a robot alone.
+        from sims.robot.totals import totals
+
+        placed = list(self._placed(model))
+        fitted = [(effect, [numbers[i].value for i in places]) for effect, places in placed]
+        for (effect, places), made in zip(placed, totals(kind.robot, fitted), strict=True):
+            # The model file keeps its gravity where bodies are compensated.
+            keeps = is_gravity_compensated(effect.name, {"": numbers[places[0]]})
+            if keeps or not any(numbers[i].value for i in places):
+                continue
+            for i, found in zip(places, made, strict=True):
+                if found is not None:
+                    unit = found.unit if found.unit != numbers[i].unit else ""
+                    stated, total = found.stated, found.total
+                    numbers[i] = replace(numbers[i], stated=stated, total=total, total_unit=unit)
+        return numbers
+
+    def _placed(self, model: Model) -> Iterator[tuple[type[Effect], list[int]]]:
+        """The effects at one place each that were fitted, with the places of their numbers."""
+        world, kind = self.fitting, cast(Any, self.fitting.kind)
+        # The user's free numbers come first, in the order of their effects.
+        places = iter(range(world.own))
+        for effect in kind.system.freed_effects:
+            yield effect, [next(places) for _ in effect.coefficients]
+        for name in model.names:
+            effect = world.effects[name]
+            members = getattr(effect, "members", ()) or (effect,)
+            places = iter(world.places(name))
+            # A family with one number for all places changes no number of the file.
+            if sum(len(member.coefficients) for member in members) == len(world.places(name)):
+                for member in members:
+                    yield type(member), [next(places) for _ in member.coefficients]
 
     def _ranges(self, model: Model) -> dict[int, tuple[float, float]]:
         """Where the fit of a model could move each number, by its place."""
@@ -121,12 +173,48 @@ class Assessor:
         return ranges
 
     def judged(self, search: Search, finding: Finding) -> Finding:
-        """The finding with the verdict that its numbers allow."""
+        """The finding with the verdict that its numbers and the fitted models allow."""
+        if finding.verdict == "unknown" and self._refutes(search, finding):
+            return replace(finding, verdict="adequate")
         numbers = self.numbers(search, finding.model)
         certain = [cause for cause in finding.causes if not cause.alternatives]
         places = [i for cause in certain for i in self.fitting.places(cause.effect)]
-        results = all(numbers[i].is_result for i in places)
+        results = all(numbers[i].is_result for i in places) and not self._ends_at_bound(numbers)
         return replace(finding, verdict=rules.verdict_of_numbers(finding.verdict, results))
+
+    def _refutes(self, search: Search, finding: Finding) -> bool:
+        """Whether a linear score is all that speaks for something missing, and no fitted model with
+        it explains the data better, or none predicts the held-out runs better. In closed loops and
+        at rest, derivatives may promise what no fit delivers.
+        """
+        if finding.causes or finding.remains.structure or finding.cut is not None:
+            return False
+        tried = [model for model in search.models.values() if model.names]
+        better = [model.names for model in tried if model.merit > search.base.merit]
+        held_out = finding.measured or {}
+        excess = self._held_out_excess(finding)
+        if not tried or (excess is not None and rules.is_missed(excess, excess)):
+            return False
+        return not any(
+            names not in held_out or held_out[names].merit > held_out[()].merit for names in better
+        )
+
+    def _held_out_excess(self, finding: Finding) -> float | None:
+        """RMS of what the base model leaves of held-out runs in units of the noise, less one; None
+        where none were simulated.
+        """
+        runs, measured = self.measuring, finding.measured
+        if runs is None or measured is None or () not in measured:
+            return None
+        left = (runs.observed - measured[()].simulated) / self.floor.sigma
+        return float(np.sqrt(np.square(left[np.isfinite(runs.observed)]).mean())) - 1.0
+
+    def _ends_at_bound(self, numbers: Mapping[int, Number]) -> bool:
+        """Whether a base parameter of the extended model lies at a bound of its range: a cause may
+        then stand for a value beyond it.
+        """
+        fitted = [numbers[i] for i in self.fitting.base.tolist()]
+        return any(n.at_bound is not None and not n.is_result for n in fitted)
 
     def sigma(self, finding: Finding) -> Array:
         """(C,) the noise floor: stated, or what a model that leaves no structure leaves."""
@@ -141,11 +229,18 @@ class Assessor:
         effect = world.effects[evidence.effect]
         coefficients = effect.on(world.simulator.system)
         places = range(*world.slots[evidence.effect].indices(len(world.parameters)))
-        by_name = {c.name: numbers[i] for c, i in zip(coefficients, places, strict=True)}
+        # A coefficient that cannot be observed is fixed at zero, and is no finding.
+        by_name = {
+            c.name: numbers[i]
+            for c, i in zip(coefficients, places, strict=True)
+            if c.least is None or c.least != c.most
+        }
         form = form_of(world, evidence.effect)
         says = effect.says
         if form is not None:
             says = with_solver_parameters(world, evidence.effect, says)
+        if world.kind.has_model and is_gravity_compensated(evidence.effect, by_name):
+            says = GRAVITY_COMPENSATED
         return Cause(evidence.effect, evidence.alternatives, says, by_name, evidence.p_value, form)
 
     def _counted(self) -> list[int]:

@@ -8,14 +8,14 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
 from bench.gap.assess import Assessor
 from bench.gap.causes.name import Finding, name
-from bench.gap.causes.rules import SWITCH
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import probes, remains
 from bench.gap.design import Design, design
@@ -26,14 +26,25 @@ from bench.gap.held_out import HeldOutRuns
 from bench.gap.model.base_fit import LAST_STEPS, Base, fit_base, without_step
 from bench.gap.model.crew import Crew
 from bench.gap.model.fit import Fitter
-from bench.gap.model.floor import Floor, noise_floor
+from bench.gap.model.floor import PRECISION, Floor, noise_floor
+from bench.gap.model.models import STEPS
 from bench.gap.model.noise import Noise
+from bench.gap.model.noise_free import add_least_noise
+from bench.gap.model.problem import Start
 from bench.gap.model.watch import STAGES, Watch
+from bench.gap.model.widen import Bounds, fit_wider, outside, use_bounds
 from bench.gap.model.world import World
-from bench.gap.steps import Coarse, with_numerics
+from bench.gap.steps import (
+    Coarse,
+    Reusable,
+    is_finer_model_better,
+    is_finer_step_better,
+    with_numerics,
+)
 from bench.gap.tell import Teller
 from bench.gap.unit_check import Subject, recognised, wrong_units
 from bench.gap.verdict import RecordingFault
+from bench.pages.text import joined
 from bench.problem.seeds import rng_for
 from bench.recordings.joined import load_all
 from bench.recordings.pieces import cut
@@ -51,6 +62,9 @@ SOFT_FRICTION = (
     "it fits better than stiff friction"
 )
 """What the user is told where the form of dry friction changes."""
+if TYPE_CHECKING:
+    from bench.gap.model.numerics import Finer
+
 LEAST = 2.0
 """Samples for each unknown without which nothing can be said."""
 SPARE = 4
@@ -109,6 +123,16 @@ def explain(
             return explainer.run()
 
 
+def _added_noise(channels: Sequence[str]) -> str:
+    """What is to be said of channels to which noise was added; empty where there are none."""
+    if not channels:
+        return ""
+    return (
+        f"no noise is found in {joined(channels)}: white noise of {PRECISION:g} of the range is "
+        "added, the accuracy of a simulation; smaller differences are not explained"
+    )
+
+
 class Proposed(NamedTuple):
     """An explanation, and the recording that would say more; None where no run would."""
 
@@ -152,6 +176,23 @@ class _Subject(NamedTuple):
     pieces: float | None
 
 
+class _Worlds(NamedTuple):
+    """A simulator with one step, and its runs for fitting and for measuring."""
+
+    kind: type[Simulated]
+    fitting: World
+    measuring: World | None
+
+
+class _Found(NamedTuple):
+    """An answer: the base model, the search from it, what that found, and its random numbers."""
+
+    base: Base
+    search: Search
+    finding: Finding
+    rng: np.random.Generator
+
+
 class _Explainer:
     def __init__(
         self,
@@ -185,7 +226,10 @@ class _Explainer:
         for odd in refuse_odd(self.recording, kind, force):
             say(f"{self.path}: {odd}")
         self.recording, note = cut(self.recording, kind, subject.pieces, subject.whole)
-        self.notes = (note,) if note else ()
+        recorded = self.recording.runs[0].channels
+        names = [channel.name for channel in kind.channels if channel.name in recorded]
+        self.recording, quiet = add_least_noise(self.recording, names)
+        self.notes = tuple(text for text in (note, _added_noise(quiet)) if text)
         for note in self.notes:
             say(note)
         check_recording(self.recording, kind(engine=self.engine), force)
@@ -193,18 +237,28 @@ class _Explainer:
         self.crew = crew
         self.thorough = thorough
         self.free = tuple(free)
+        # By name the declared range of a base parameter and the wider one that it was given.
+        self.wider: dict[str, tuple[Bounds, Bounds]] = {}
         self._enter(kind)
         self.coarse: Coarse | None = None
+        # Finer steps that differ from the file's, and the worlds of the file's where one is used.
+        self.finer: Reusable[Finer] | None = None
+        self.file = _Worlds(self.kind, self.fitting, self.measuring)
         self.found: tuple[Search, Finding] | None = None
         self.faults: tuple[RecordingFault, ...] = ()
         self._check()
 
     def _enter(self, kind: type[Simulated]) -> None:
         """Take the recording for one of this simulator."""
+        before = getattr(self, "fitting", None), getattr(self, "measuring", None)
         self.fitting = self._world(kind, self.recording.training())
         held_out = self.recording.held_out()
         # The same effects in the same places, so that a fitted vector means the same there.
         self.measuring = self._world(kind, held_out) if held_out else None
+        for known, world in zip(before, (self.fitting, self.measuring), strict=True):
+            if known is not None and world is not None and known.followed is not None:
+                # Where the runs begin depends little on how they are stepped.
+                world.follow(known.followed)
         self.floor: Floor = noise_floor(self.fitting, self.recording)
         # White to begin with: each likelihood finds the memory of the noise for itself.
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
@@ -218,6 +272,7 @@ class _Explainer:
         world.watch = self.watch
         world.crew = self.crew
         self.crew.join(world)
+        use_bounds(world, {name: bounds for name, (_, bounds) in self.wider.items()})
         return world
 
     def _takes_no_effects(self) -> InputError:
@@ -254,40 +309,47 @@ class _Explainer:
         base = self._base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
             raise self._fails()
-        # One stream for surrogates and bootstrap: the same seed tells the same story.
-        rng = self._rng()
-        base, search, finding = self._searched(base, rng)
+        found = self._searched(base)
+        found = self._with_better_step(found.search, found.finding) or found
+        base, search, finding, rng = found
         self.watch.stage("measuring the gain")
         verdict = self.assessor.verdict(search, finding, rng, self.started)
         verdict = replace(verdict, recording_faults=self.faults)
         if self.coarse is not None:
             verdict = with_numerics(verdict, self.coarse)
         self.found = search, finding
-        story = Teller(self.assessor, search, base, finding, self.notes).story(verdict)
+        notes = (*outside(self.fitting, finding.model.fit.theta, self.wider), *self.notes)
+        story = Teller(self.assessor, search, base, finding, notes).story(verdict)
         return Explanation(verdict, story, self._extended(search, finding))
 
-    def _searched(self, base: Base, rng: np.random.Generator) -> tuple[Base, Search, Finding]:
+    def _searched(self, base: Base) -> _Found:
         """Search and judge; again with MuJoCo's soft form of dry friction where the data show it."""
+        # One stream for surrogates and bootstrap: the same seed tells the same story.
+        rng = self._rng()
         search = self._search(base, rng)
         if not self.kind.has_model:
-            return base, search, self._finding(search)
+            return _Found(base, search, self._finding(search), rng)
         # Loaded where there is a robot alone.
         from bench.gap.prediction_error.search import SoftFrictionError
 
         try:
-            return base, search, self._finding(search)
+            return _Found(base, search, self._finding(search), rng)
         except SoftFrictionError:
             self.say(SOFT_FRICTION)
         before = self.assessor.before
         self._enter(soft_kind(self.kind))
         self.assessor = replace(self.assessor, before=before)
-        self._follow()
         fitter = Fitter(self.fitting, self.noise, base.frozen)
         start = replace(base.fit.start(), states=self.fitting.guess)
         (fit,) = fitter.fit([start], LAST_STEPS)
         base = without_step(self.fitting, self.noise, replace(base, fit=fit))
-        search = self._search(base, self._rng())
-        return base, search, self._finding(search)
+        rng = self._rng()
+        search = self._search(base, rng)
+        return _Found(base, search, self._finding(search), rng)
+
+    def _answered(self, base: Base) -> _Found:
+        """The answer from a base model that was fitted with another step."""
+        return self._searched(self._settled(base))
 
     def _finding(self, search: Search) -> Finding:
         """What the simulator lacks; no cause where the recording states a unit or a sign wrongly,
@@ -373,7 +435,9 @@ class _Explainer:
         if not self.watch.left():
             fault = wrong_units(self._units, self.fitting, self.noise, base)
             self.faults = (fault,) if fault is not None else ()
-        return base if self.faults or not self.kind.has_model else self._prepared(base)
+        if self.faults:
+            return base
+        return self._prepared(base) if self.kind.has_model else self._within_range(base)
 
     @property
     def free_numbers(self) -> bool:
@@ -396,9 +460,7 @@ class _Explainer:
         """
         if self._shows_steps(base):
             base = self._stepped(base)
-        base = self._frozen(base)
-        # What is asked about as a cause comes first: it would not be seen afterwards.
-        return without_step(self.fitting, self.noise, base)
+        return self._settled(base)
 
     def _shows_steps(self, base: Base) -> bool:
         """Whether the recording shows what the engine's steps miss."""
@@ -411,6 +473,24 @@ class _Explainer:
         search = self._search(base, self._rng())
         assert isinstance(search, PredictionErrorSearch)
         return needs_correction(search.follow())
+
+    def _settled(self, base: Base) -> Base:
+        """The base model of a robot whose step is chosen."""
+        base = self._frozen(self._within_range(base))
+        # What is asked about as a cause comes first: it would not be seen afterwards.
+        return without_step(self.fitting, self.noise, base)
+
+    def _within_range(self, base: Base) -> Base:
+        """The base model with wider ranges for parameters that its fit leaves at a bound."""
+        declared = {p.name: p.bounds for p in self.fitting.parameters}
+        declared |= {name: bounds for name, (bounds, _) in self.wider.items()}
+        base, found = fit_wider(self.fitting, self.noise, base)
+        if self.measuring is not None:
+            use_bounds(self.measuring, found)
+        for parameter, (low, high) in found.items():
+            self.say(f"{parameter} ends at a bound of its range: widened to {low:g} to {high:g}")
+        self.wider |= {one: (declared[one], bounds) for one, bounds in found.items()}
+        return base
 
     def _frozen(self, base: Base) -> Base:
         """The base model without free numbers of the robot that the data cannot fix.
@@ -426,33 +506,96 @@ class _Explainer:
         return kept
 
     def _stepped(self, base: Base) -> Base:
-        """The base model with the step that the data ask for; its worlds are the explainer's."""
+        """The base model with the step that closes a large part of its gap alone: the file's own,
+        or a finer one. Its worlds are the explainer's.
+        """
         # Loaded where there is a robot alone.
         from bench.gap.model.numerics import finer
 
-        coarse = self.kind, self.fitting, self.measuring
+        self.finer = Reusable(finer(self.fitting, self.noise))
+        file = _Worlds(self.kind, self.fitting, self.measuring)
         value, left = self._judged(base)
-        for fine in finer(self.fitting, self.noise):
+        gap = left - 1.0
+        for fine in self.finer:
             # A finer step leaves less: one that is too coarse for what is left is not tried.
             if not fine.suits(left):
                 continue
             self._enter(fine.kind)
             other = fit_base(self.fitting, self.noise, self._nearby(base))
             reached, left = self._judged(other)
-            gain = reached - value
-            if gain < SWITCH:
-                # What the robot does is no nearer to its fine motion: the file's own step stands.
+            if not is_finer_step_better(reached - value, gap, left - 1.0):
+                # Another missing effect may bend either model: both are compared again with it.
                 if fine.suits(0.0):
                     break
                 left = 0.0
             elif fine.suits(left):
-                numerics = fine.numerics
-                self.say(f"stepped more finely: {numerics.integrator}, {numerics.timestep:g} s")
-                self.coarse = Coarse(fine, gain)
-                self.assessor = replace(self.assessor, before=self._before(base, coarse[2]))
+                self._use_finer(fine, reached - value, base, file)
                 return other
-        self._return(*coarse)
+        self._return(file)
         return base
+
+    def _use_finer(self, fine: Finer, gain: float, base: Base, file: _Worlds) -> None:
+        """State that the file's own step is at fault; the worlds are those of the finer one."""
+        numerics = fine.numerics
+        self.say(f"stepped more finely: {numerics.integrator}, {numerics.timestep:g} s")
+        self.coarse, self.file = Coarse(fine, gain), file
+        self.assessor = replace(self.assessor, before=self._before(base, file.measuring))
+
+    def _with_better_step(self, search: Search, finding: Finding) -> _Found | None:
+        """The answer with another step, where that explains the data better with the effects of
+        this answer or with some of them; None where this step stands.
+
+        A missing effect can make either step look better, and effects can imitate a step, so the
+        first choice is preliminary. Models are compared by merit and residual, and a finer step
+        must be clearly better: data that MuJoCo made with the file's own step must
+        not be explained by another.
+        """
+        if self.finer is None or self.faults or finding.cut is not None or self.watch.left():
+            return None
+        if not finding.causes and (self.coarse is not None or finding.verdict == "adequate"):
+            return None
+        found = finding.model.merit, search.excess(finding.model)
+        here = _Worlds(self.kind, self.fitting, self.measuring)
+        if self.coarse is not None:
+            before = self.assessor.before
+            self._return(self.file)
+            if not is_finer_model_better(self._best(search, finding), found):
+                self.say("the model file's own step explains the data as well: it is used")
+                self.coarse = None
+                base = Base(search.base.fit, search.frozen)
+                return self._answered(fit_base(self.fitting, self.noise, self._nearby(base)))
+            self._return(here, before)
+            return None
+        fine = next((one for one in self.finer or () if one.suits(0.0)), None)
+        if fine is None:
+            return None
+        self._enter(fine.kind)
+        best = self._best(search, finding)
+        if not is_finer_model_better(found, best):
+            self._return(here)
+            return None
+        base = Base(search.base.fit, search.frozen)
+        other = fit_base(self.fitting, self.noise, self._nearby(base))
+        self._use_finer(fine, best[0] - found[0], base, here)
+        return self._answered(other)
+
+    def _best(self, search: Search, finding: Finding) -> tuple[float, float]:
+        """Merit and excess over the noise of the best model with some or all effects of a finding,
+        fitted with the step of the present worlds.
+        """
+        names, fit = finding.model.names, finding.model.fit
+        slots = self.fitting.slots
+        starts = []
+        for count in range(len(names) + 1):
+            for some in combinations(names, count):
+                theta = fit.theta.copy()
+                for left_out in set(names) - set(some):
+                    theta[slots[left_out]] = self.fitting.nominal()[slots[left_out]]
+                starts.append(Start(some, theta, fit.states))
+        fits = Fitter(self.fitting, self.noise, search.frozen).fit(starts, STEPS)
+        models = self._search(Base(search.base.fit, search.frozen), self._rng())
+        best = max((models.enter(one) for one in fits), key=lambda model: model.merit)
+        return best.merit, models.excess(best)
 
     def _nearby(self, base: Base) -> Array | None:
         """Where a fit of finer steps begins: a step moves the best parameters a little, and its
@@ -469,10 +612,11 @@ class _Explainer:
             return None
         return HeldOutRuns(measuring, self.noise).measure([base.fit.theta])[0].simulated
 
-    def _return(self, kind: type[Simulated], fitting: World, measuring: World | None) -> None:
+    def _return(self, worlds: _Worlds, before: Array | None = None) -> None:
         """Go back to worlds that were left."""
-        self.kind, self.fitting, self.measuring = kind, fitting, measuring
-        self.assessor = Assessor(self.recording, fitting, measuring, self.floor, self.engine)
+        self.kind, self.fitting, self.measuring = worlds
+        given = self.recording, self.fitting, self.measuring, self.floor, self.engine
+        self.assessor = Assessor(*given, before)
 
     def _judged(self, base: Base) -> tuple[float, float]:
         """Twice the log likelihood of a base model, and what it leaves, RMS in units of the

@@ -17,7 +17,7 @@ from bench.gap.model.base_fit import Base
 from bench.gap.report import show
 from bench.gap.report.places import of_set
 from bench.gap.report.story import Place, Shown, Side, Story, Tuned
-from bench.gap.report.words import END
+from bench.gap.report.words import END, in_file
 from bench.gap.verdict import Verdict
 from sims.base import Array
 from sims.extended import Number as Estimate
@@ -172,6 +172,7 @@ class Teller:
                 _triple(after[i]),
                 touched,
                 (before[i].at_bound, after[i].at_bound),
+                in_file(after[i]),
             )
 
     def _remains(self) -> Iterator[str]:

@@ -68,8 +68,10 @@ WORST = 3
 """Channels of a robot with the largest misfit whose joints are questioned."""
 CLOSE = 0.02
 """Relative difference of a fitted gain from a conversion of units that is taken for it."""
-IGNORED = 0.1
-"""Magnitude of a fitted sensor gain below which the reading hardly depends on the simulation."""
+IGNORED = 0.2
+"""Magnitude of a fitted sensor gain at which the reading hardly depends on the simulation: the
+lower bound of the gain's range.
+"""
 
 BEGINNING = HORIZONS[0].share
 """The first share of each run, by which hypotheses are screened."""
@@ -336,7 +338,7 @@ def recognised(subject: Subject, world: World, cause: Cause, base: Fit) -> Recor
         if wanted * factor > 0 and abs(math.log(wanted / factor)) < CLOSE:
             others = tuple(_BEYOND.format(name) for name in _ends(world, base))
             return replace(one.fault(subject.file, None, None), alternatives=others)
-    if kind == "channels" and abs(gain) < IGNORED:
+    if kind == "channels" and abs(gain) <= IGNORED:
         says = (
             f"The fit makes {signal.said} nearly independent of the simulation (a sensor gain of "
             f"{coefficient.value:.4g}), which is not an answer: check the unit, the column and the "

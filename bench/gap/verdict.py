@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.gap.causes.rules import CUT, FAULTY, MEANING, OPEN, VerdictName
+from bench.gap.causes.rules import BORDERING, CUT, FAULTY, MEANING, OPEN, VerdictName
 from bench.gap.model.watch import Cut
 from bench.gap.propose import Experiment
 from sims.extended import Number
@@ -230,12 +230,22 @@ class Verdict:
             return FAULTY
         if self.cut is None and self.has_open_numbers:
             return OPEN
+        if self.cut is None and self.bordering:
+            return BORDERING
         return MEANING[self.verdict] if self.cut is None else CUT[self.verdict]
 
     @property
     def has_open_numbers(self) -> bool:
         """Whether the verdict is `partial` and a number of a cause is not a result."""
         return self.verdict == "partial" and any(cause.open_numbers for cause in self.causes)
+
+    @property
+    def bordering(self) -> dict[str, Number]:
+        """Base parameters at a bound of their range, where that makes the verdict `partial`."""
+        if self.verdict != "partial" or not self.causes:
+            return {}
+        numbers = self.parameters.items()
+        return {k: n for k, n in numbers if n.at_bound is not None and not n.is_result}
 
     def document(self) -> Document:
         """The content of verdict.json."""
@@ -293,15 +303,28 @@ def finite(value: float) -> float | None:
 
 def _estimates(numbers: Mapping[str, Number]) -> Document:
     """Numbers as in verdict.json, by name."""
-    return {
-        name: {"value": n.value, "unit": n.unit, "low": n.low, "high": n.high}
-        | ({"at_bound": n.at_bound} if n.at_bound is not None else {})
-        for name, n in numbers.items()
-    }
+    return {name: _estimate(number) for name, number in numbers.items()}
+
+
+def _estimate(number: Number) -> Document:
+    found: Document = {key: getattr(number, key) for key in ("value", "unit", "low", "high")}
+    # What says nothing of a number is left out.
+    for key in ("at_bound", "stated", "total", "total_unit"):
+        if (value := getattr(number, key)) not in (None, ""):
+            found[key] = value
+    if number.usual_range is not None:
+        found["usual_range"] = list(number.usual_range)
+    return found
 
 
 def _numbers(document: Mapping[str, Any]) -> dict[str, Number]:
-    return {name: Number(**estimate) for name, estimate in document.items()}
+    return {name: _number(estimate) for name, estimate in document.items()}
+
+
+def _number(estimate: Mapping[str, Any]) -> Number:
+    usual = estimate.get("usual_range")
+    ends = (float(usual[0]), float(usual[1])) if usual is not None else None
+    return Number(**{**estimate, "usual_range": ends})
 
 
 def _short(number: Number) -> str:

@@ -54,6 +54,13 @@ def estimated(signals: Iterable[tuple[Array, Array]]) -> NoiseEstimate:
     return NoiseEstimate(max(float(np.nanmin(sigmas)), step / 12**0.5), step)
 
 
+def differences_sigma(signals: Iterable[tuple[Array, Array]], order: int) -> float:
+    """1 sigma of white noise from divided differences (1) of one order, over all runs; NaN where
+    all are too short. The higher the order, the less of a smooth motion is left.
+    """
+    return _sigma([(t[seen], y[seen]) for t, y in signals if (seen := np.isfinite(y)).any()], order)
+
+
 def _sigma(runs: list[tuple[Array, Array]], order: int) -> float:
     """1 sigma from differences of one order, over all runs; NaN where all are too short."""
     rests = [_rests(t, y, order) for t, y in runs if t.size > order + 1]

@@ -94,7 +94,10 @@ def _gap(run: Run) -> Oddity | None:
 
 
 def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Oddity | None:
-    """Whether the run moves far more slowly than its system would."""
+    """The oddity of a run in which every coordinate moves far more slowly than its system would, or
+    far faster. All coordinates share the stamps, so one that moves as expected clears them; another
+    may belong to a link without inertia in the model file.
+    """
     # What steps itself tells nobody its forces.
     if not issubclass(kind, Simulated) or (kind.own_engine and not kind.has_model):
         return None
@@ -107,6 +110,7 @@ def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Oddity | Non
     # A servo stands still by force: what would move it is nothing to wonder about.
     servo = kind.has_model and _driven(run)
     sizes = {channel.name: channel.scale for channel in system.channels}
+    first: Oddity | None = None
     for column, name in enumerate(system.coordinates):
         x = run.channels.get(name)
         if x is None:
@@ -120,16 +124,17 @@ def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Oddity | Non
         ratio = recorded / own
         if 0 < ratio < 1 / FACTOR:
             moves = f"{name} moves in {recorded:.3g} s as {kind.name} would within {own:.2g} s"
-            return Oddity(f"run {run.name}: {moves}; are the stamps seconds?", False)
-        if ratio < FACTOR or interval < (DRIVEN * own if servo else own):
+            first = first or Oddity(f"run {run.name}: {moves}; are the stamps seconds?", False)
             continue
+        if ratio < FACTOR or interval < (DRIVEN * own if servo else own):
+            return None
         unit = min(_UNITS, key=lambda factor: abs(np.log(ratio / factor)))
         moves = f"{name} takes {recorded:.3g} s to move as {kind.name} would within {own:.2g} s"
         apart = f"samples lie {interval:.3g} s apart"
         remedy = f"are the stamps {_UNITS[unit]}? then divide t by {unit:g}"
         certain = not _driven(run) or interval >= DRIVEN * own
-        return Oddity(f"run {run.name}: {moves}, and {apart}; {remedy}", certain)
-    return None
+        first = first or Oddity(f"run {run.name}: {moves}, and {apart}; {remedy}", certain)
+    return first
 
 
 def _driven(run: Run) -> bool:

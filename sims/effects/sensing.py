@@ -32,6 +32,12 @@ _PURE = ("1", "1", "1")
 """A pure number, on every kind of system."""
 _FIFTH = ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))
 """Plausible gains: a fifth too much or too little."""
+_LEAST_GAIN = -0.8
+"""A sensor shows at least a fifth of the true value: a reading that hardly depends on what is
+measured would agree with any constant signal.
+"""
+_MOST_GAIN = 4.0
+"""And at most five times the true value."""
 _LENGTH = ("m", "m", "rad")
 """Units of a reading that is a position; it may be another."""
 _OFFSET = ((-1, 1), (-0.2, 0.2), (-0.2, 0.2))
@@ -62,7 +68,7 @@ class Gain(Sensor):
     noun = "a sensor gain"
     says = "the sensor shows too much or too little, in proportion"
     source = _VOCABULARY + ", 4.12"
-    coefficients = (Coefficient("coefficient", _PURE, _FIFTH),)
+    coefficients = (Coefficient("coefficient", _PURE, _FIFTH, least=_LEAST_GAIN, most=_MOST_GAIN),)
 
     def read(self, c: Array, signal: Signal) -> Array:
         """In proportion."""

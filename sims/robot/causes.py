@@ -21,6 +21,22 @@ _AXES: Mapping[str, tuple[str, ...]] = {
 """Coefficients of effects that have several, in their order."""
 
 
+COMPENSATED = 0.02
+"""Share of its weight that a robot with compensated gravity still feels at most."""
+
+GRAVITY_COMPENSATED = "gravity is compensated: the real robot or its controller carries its weight"
+"""What is said of a correction of gravity that takes all of it away."""
+
+
+def is_gravity_compensated(effect: str, numbers: Mapping[str, Number]) -> bool:
+    """Whether a correction of gravity takes all of it away: the real robot, or its controller,
+    carries its own weight.
+    """
+    return effect == "gravity.scale" and any(
+        abs(1.0 + number.value) < COMPENSATED for number in numbers.values()
+    )
+
+
 @dataclass(frozen=True)
 class Cause:
     """An effect at one place, with its numbers.
@@ -60,10 +76,20 @@ class Cause:
 
 
 def _told(number: Number) -> str:
-    unit = "" if number.unit == "1" else f" {number.unit}"
-    if number.low is None or number.high is None:
-        return f"{number.value:.4g}{unit}"
-    return f"{number.value:.4g}{unit} (95 %: {number.low:.4g} to {number.high:.4g})"
+    """``-0.05 N*m (95 %: -0.06 to -0.04), from 0.2 to 0.15 N*m``: the last part is the number that
+    the file has before and after.
+    """
+    text = f"{number.value:.4g}{_unit(number.unit)}"
+    if number.low is not None and number.high is not None:
+        text += f" (95 %: {number.low:.4g} to {number.high:.4g})"
+    if number.stated is not None and number.total is not None:
+        unit = _unit(number.total_unit or number.unit)
+        text += f", from {number.stated:.4g} to {number.total:.4g}{unit}"
+    return text
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else f" {unit}"
 
 
 def one_by_one(robot: Robot, causes: Mapping[str, Mapping[str, Number]]) -> list[Cause]:

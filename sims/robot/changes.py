@@ -14,7 +14,7 @@ import numpy as np
 
 from sims import effects as library
 from sims.extended import Number
-from sims.robot.causes import Cause, one_by_one
+from sims.robot.causes import Cause, is_gravity_compensated, one_by_one
 from sims.robot.commands import COMMANDS, order
 from sims.robot.coupled import EFFECT as COUPLED
 from sims.robot.coupled import coupled
@@ -174,6 +174,10 @@ def _write(
     # A coupling is an element of its own, which the robot has by now.
     if cause.effect == COUPLED:
         return None
+    if is_gravity_compensated(cause.effect, cause.numbers):
+        for body in robot.bodies:
+            wanted["body_gravcomp"][0, body.id] = 1.0
+        return "+gravity is compensated: the bodies have gravcomp = 1, and gravity is as it was"
     if cause.effect in FIELDS:
         FIELDS[cause.effect].write(wanted, robot, cause.place, cause.coefficients[:, None])
         return None
@@ -234,9 +238,8 @@ class Elements:
         """The spec's element."""
         if element.kind == "option":
             return self.spec.option
-        return {"joint": self.joints, "body": self.bodies, "actuator": self.actuators}[
-            element.kind
-        ][element.id]
+        of_kind = {"joint": self.joints, "actuator": self.actuators}
+        return of_kind.get(element.kind, self.bodies)[element.id]
 
 
 def state(element: Any, statement: Statement) -> None:

@@ -58,6 +58,10 @@ class Writer:
         element = statement.element
         if element.kind == "option":
             self._option(statement, comments)
+        elif element.kind == "weight":
+            body = self.tags[Element("body", element.id)]
+            _say(body, comments)
+            body.new |= texts(statement.values)
         elif element.kind == "body":
             if statement.values:
                 self._keep_masses()

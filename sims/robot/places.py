@@ -272,12 +272,17 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
         high = 3.0 * spot.inertia
     if c.of == "give":
         high = 1.0 / (spot.inertia * SLOWEST**2)
+    most = c.most
     stated = spot.stated.get(effect.name) if effect.at == "joint" else None
     if stated is not None:
-        # The difference may take away what the file states, and no more.
+        # The total is not negative: the difference may take away what the file states, and no more.
         high = max(high, 2.0 * abs(stated))
-        low = least = min(-stated, 0.0)
-    return replace(c, units=(unit,) * 3, plausible=((low, high),) * 3, least=least)
+        low = least = min(0.0 - stated, 0.0)
+    if effect.name == "mass.offset":
+        least, most = spot.offsets[c.name]
+        if least < most:
+            low, high = max(low, least), min(high, most)
+    return replace(c, units=(unit,) * 3, plausible=((low, high),) * 3, least=least, most=most)
 
 
 def classes(

@@ -20,6 +20,10 @@ ACCELERATION = 5.0
 """rad/s^2 or m/s^2 that a joint of its inertia is taken to reach."""
 LEAST = 1e-4
 """N or N m; no joint is taken to carry less."""
+NEIGHBOUR = 0.01
+"""Ranges of coefficients suit a joint of at least this share of the force and inertia of the joint
+that carries it: a smaller value is more likely a missing inertia of the file than a light link.
+"""
 
 
 class Scales(NamedTuple):
@@ -56,6 +60,32 @@ def scales(robot: Robot) -> Scales:
     inertia = np.mean(inertias, axis=0)
     force = np.maximum(np.max(weights, axis=0), ACCELERATION * inertia)
     return Scales(np.maximum(force, LEAST), np.maximum(inertia, 1e-9))
+
+
+def coefficient_scales(robot: Robot) -> Scales:
+    """Return force and inertia of each joint (D,) that the ranges of coefficients follow.
+
+    They are those of `scales`, where a joint counts for at least `NEIGHBOUR` times the joint of the
+    same kind that carries it, so that a link whose inertia the file leaves out (1e-9 kg m^2) does
+    not make the ranges of its joint vanish.
+    """
+    own = scales(robot)
+    force, inertia = own.force.copy(), own.inertia.copy()
+    model = robot.compiled
+    joints = [joint for joint in robot.joints if joint.single]
+    last: dict[tuple[int, str], int] = {}
+    # Bodies are numbered from the base outwards, so a parent joint has its final value already.
+    for number, joint in enumerate(joints):
+        body = int(model.jnt_bodyid[joint.id])
+        parent = last.get((body, joint.kind))
+        while parent is None and body:
+            body = int(model.body_parentid[body])
+            parent = last.get((body, joint.kind))
+        if parent is not None:
+            force[number] = max(force[number], NEIGHBOUR * force[parent])
+            inertia[number] = max(inertia[number], NEIGHBOUR * inertia[parent])
+        last[int(model.jnt_bodyid[joint.id]), joint.kind] = number
+    return Scales(force, inertia)
 
 
 def floating_forces(robot: Robot) -> Array:

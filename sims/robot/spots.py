@@ -5,11 +5,13 @@ with what the file states of each.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
 from sims.robot.coupled import places as coupled_places
+from sims.robot.mass_offset import observable_axes, reach
 from sims.robot.model import Robot
 
 WORDS = {
@@ -44,6 +46,9 @@ class Spot(NamedTuple):
         servo: whether it is an actuator that follows a set point of its position.
         last: whether it is a joint, the last one of its body.
         coupled: whether it is a joint whose drive may be coupled to the joint before.
+        offsets: of a body, by axis of its frame (``x``, ``y``, ``z``), the lowest and the highest
+            offset in metres that leaves its centre of mass within the link; both zero along an
+            axis where an offset cannot be observed.
     """
 
     name: str
@@ -58,6 +63,7 @@ class Spot(NamedTuple):
     servo: bool = False
     last: bool = False
     coupled: bool = False
+    offsets: Mapping[str, tuple[float, float]] = MappingProxyType({})
 
 
 def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[Spot]]:
@@ -67,9 +73,9 @@ def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[S
         robot: whose.
         channels: names and units of those that it can show.
     """
-    from sims.robot.scales import scales
+    from sims.robot.scales import coefficient_scales
 
-    sizes = scales(robot)
+    sizes = coefficient_scales(robot)
     found: dict[str, list[Spot]] = {"joint": [], "actuator": [], "body": [], "channel": []}
     numbers: dict[str, int] = {}
     may_be_coupled = coupled_places(robot)
@@ -110,7 +116,12 @@ def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[S
     for body in robot.bodies:
         nothing: Mapping[str, float] = {}
         words = f"body {body.name}"
-        found["body"].append(Spot(body.name, "hinge", None, "", "kg", 1.0, 1.0, nothing, words))
+        box = reach(robot, body.name)
+        axes = observable_axes(robot, body.name)
+        ends = np.where(np.isin(range(3), axes)[:, None], box, 0.0).tolist()
+        offsets = {axis: (low, high) for axis, (low, high) in zip("xyz", ends, strict=True)}
+        spot = Spot(body.name, "hinge", None, "", "kg", 1.0, 1.0, nothing, words, offsets=offsets)
+        found["body"].append(spot)
     for name, unit in channels:
         _, _, of = name.partition(".")
         coordinate = numbers.get(of) if name.startswith(("q.", "qd.", "tau.")) else None

@@ -10,7 +10,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-Kind = Literal["joint", "body", "actuator", "option", "compiler"]
+Kind = Literal["joint", "body", "weight", "actuator", "option", "compiler"]
+"""Kinds of elements; a ``weight`` is what a body says of its own weight, next to its inertial."""
 
 Fields = dict[str, Any]
 """Fields of a compiled model by name, arrays (1, ...): one lane."""
@@ -93,6 +94,7 @@ ATTRIBUTES: Mapping[Kind, tuple[Attribute, ...]] = {
         Attribute("mass", "mass", _of("body_mass")),
         Attribute("diaginertia", "inertia", _of("body_inertia")),
     ),
+    "weight": (Attribute("gravcomp", "gravcomp", _of("body_gravcomp")),),
     "actuator": (
         Attribute("dyntype", "dyntype", _of("actuator_dyntype")),
         Attribute("dynprm", "dynprm", _of("actuator_dynprm")),
@@ -120,7 +122,7 @@ ATTRIBUTES: Mapping[Kind, tuple[Attribute, ...]] = {
 _NAMES = (
     *("dof_damping", "dof_dampingpoly", "dof_frictionloss", "dof_solref", "dof_solimp"),
     *("jnt_stiffness", "jnt_stiffnesspoly", "qpos_spring", "dof_armature"),
-    *("body_ipos", "body_iquat", "body_mass", "body_inertia"),
+    *("body_ipos", "body_iquat", "body_mass", "body_inertia", "body_gravcomp"),
     *("actuator_dyntype", "actuator_dynprm", "actuator_gaintype", "actuator_gainprm"),
     *("actuator_biastype", "actuator_biasprm", "actuator_ctrllimited", "actuator_ctrlrange"),
     *("actuator_forcelimited", "actuator_forcerange", "actuator_delay", "actuator_history"),
@@ -164,6 +166,7 @@ def elements(model: Any) -> list[Element]:
     one = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     found = [Element("joint", i) for i in range(model.njnt) if int(model.jnt_type[i]) in one]
     found += [Element("body", i) for i in range(1, model.nbody)]
+    found += [Element("weight", i) for i in range(1, model.nbody)]
     single = [i for i in range(len(model.actuator_ctrlnum)) if int(model.actuator_ctrlnum[i]) == 1]
     found += [Element("actuator", i) for i in single]
     return [*found, Element("option", 0)]

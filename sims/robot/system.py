@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar
 
+import numpy as np
+
 from sims import effects as library
 from sims.base import Array, Channel, InputError, Parameter, unknown
 from sims.registry import SkippedError
@@ -231,12 +233,14 @@ def _parameters(effect: type[Effect]) -> list[Parameter]:
     result = []
     for c in effect.coefficients:
         low, high = c.plausible[0]
-        least = WIDER * low if c.least is None else max(WIDER * low, c.least)
         # A gain that is free is a guess: it may be several times as large.
-        reach = GUESSED if effect.at == "actuator" and c.least is not None else WIDER * high
+        guess = effect.at == "actuator" and c.least is not None
+        bounds = WIDER * low, GUESSED if guess else WIDER * high
+        # What cannot be observed has no range of its own; the data will not fix it.
+        if c.least is not None and c.least != c.most:
+            bounds = max(bounds[0], c.least), min(bounds[1], c.most or np.inf)
         name = effect.name if len(effect.coefficients) == 1 else f"{effect.name}.{c.name}"
         unit = c.units[0] or "1"
-        bounds = (least, reach)
         result.append(Parameter(name, unit, 0.0, bounds, (low, high), says=effect.says))
     return result
 

@@ -232,6 +232,14 @@ ESTIMATE = {
     "high": "the other end",
     "at_bound": "which end of its range the number lies at, where there is no interval; left out "
     "where it lies inside",
+    "stated": "the number of the robot's model file that the estimate changes, such as a joint's "
+    "damping or a body's mass; of an inertia tensor its largest principal moment; left out where "
+    "the file has no such number",
+    "total": "the same number with what was found in it, as extended.xml states it; left out "
+    "where `stated` is",
+    "total_unit": "unit of `stated` and `total`; left out where it is `unit`",
+    "usual_range": "lowest and highest value that one would expect; left out where the value lies "
+    "between them",
 }
 """A number says this in one sentence, which a table needs by its fields."""
 

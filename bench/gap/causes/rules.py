@@ -68,6 +68,11 @@ CUT: Mapping[VerdictName, str] = {
 """The same as `MEANING` of a search that was ended early, which has no other verdicts."""
 OPEN: str = "a cause is found, but a number of it lies at a bound or has no finite interval"
 """What `partial` says where a number of a cause is not a result."""
+BORDERING: str = (
+    "a cause is found, but a base parameter ends at a bound of its range, "
+    "and the cause may stand for a value beyond it"
+)
+"""What `partial` says where a base parameter is not a result."""
 FAULTY: str = "the recording states a unit or a sign wrongly; correct it before causes are searched"
 """What `unknown` says of a recording with a wrong unit or sign."""
 LAST: Collection[str] = frozenset({"structure", "alternatives"})

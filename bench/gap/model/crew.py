@@ -127,6 +127,10 @@ class Crew:
         """Know of a world that there will be work on, so that workers know it from their start."""
         self._worlds.append(world)
 
+    def forget(self, world: Place) -> None:
+        """Start new workers before the next work on a world, since it has changed."""
+        self._known = [known for known in self._known if known is not world]
+
     def close(self) -> None:
         """End all workers, whatever they are at, and do without."""
         for worker in list(self._team):

@@ -54,9 +54,9 @@ def noise_floor(world: World, recording: Recording) -> Floor:
         sigma = recording.noise[channel.name] if known else estimate.sigma
 
         # no simulation is as exact as an error of nothing asks for
-        least = max(PRECISION * _range(values), LEAST)
-        # too few samples, or none
-        if not np.isfinite(sigma):
+        least = max(PRECISION * range_of(values), LEAST)
+        # too few samples, or none; of a channel that never changes no sample tells of its noise
+        if not np.isfinite(sigma) or (not known and is_constant(values)):
             sigma = TYPICAL * channel.scale
         sigmas.append(max(sigma, least))
         stated.append(known)
@@ -70,6 +70,11 @@ def noise_floor(world: World, recording: Recording) -> Floor:
     )
 
 
-def _range(values: Array) -> float:
+def is_constant(values: Array) -> bool:
+    """Whether there are samples (n,) and all are the same."""
+    return bool(values.size) and not np.ptp(values)
+
+
+def range_of(values: Array) -> float:
     """The range of values (n,) but for outliers; 0 of none."""
     return float(np.ptp(np.quantile(values, INNER))) if values.size else 0.0

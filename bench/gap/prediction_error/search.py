@@ -177,7 +177,8 @@ class PredictionErrorSearch(Search):
     def follow(self) -> FollowedRuns:
         """Return the runs as the filter follows them with the base model."""
         theta, known = self.base.fit.theta, self.world.followed
-        if known is None or not np.array_equal(known.theta, theta):
+        same = known is not None and known.world is self.world
+        if known is None or not same or not np.array_equal(known.theta, theta):
             self.world.watch.stage("following the runs with the model", 1)
             nearby = None if known is None else known.trajectories()
             known = FollowedRuns.follow(self.world, theta, self.noise, nearby)

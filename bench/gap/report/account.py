@@ -139,6 +139,14 @@ def headline(story: Story) -> str:
         return f"The simulation {lacks(causes)}: these data cannot tell which."
     if verdict == "partial" and (open_ones := [c for c in causes if c.open_numbers]):
         return f"The simulation {lacks(causes)}, but {_undetermined(open_ones)}."
+    if bordering := story.verdict.bordering:
+        (name, first), *_ = bordering.items()
+        end = f"the {END[first.at_bound or 'high']} bound of its range"
+        value = with_unit(number(first.value), first.unit)
+        why = f"parameter {clean(name, 60)} ends at {end}, {value}"
+        return (
+            f"The simulation {lacks(causes)}, but {why}: the cause may stand for a value beyond it."
+        )
     if verdict == "partial":
         more = "something else that no known cause explains"
         if len(causes) == 1 and (said := sized(causes[0])):
@@ -485,7 +493,8 @@ def moves(story: Story, p: Tuned) -> str:
         nominal = f"its nominal {number(p.before[0])}{unit}"
         return f"{name} is not touched by these data and stays at {nominal}."
     if not story.verdict.causes:
-        return f"{name} = {tuned(p, 0)}."
+        # Nothing was found: the last fit is of the base model, too, and the best one.
+        return f"{name} = {tuned(p, 1)}."
     before, after = tuned(p, 0), tuned(p, 1)
     end = ": it had absorbed part of the gap." if absorbed(p) else "."
     return f"{name} {before} before, {after} after ({shift(p)}){end}"
@@ -494,9 +503,10 @@ def moves(story: Story, p: Tuned) -> str:
 def tuned(p: Tuned, when: int) -> str:
     """A parameter's estimate before (0) or after (1), with its interval or the bound it lies at."""
     value, bound = (p.before, p.after)[when], p.bounds[when]
+    total = p.in_file if when else ""
     if bound is not None:
-        return at_bound(value[0], p.unit, bound)
-    return with_unit(estimate(*value), p.unit)
+        return at_bound(value[0], p.unit, bound) + total
+    return with_unit(estimate(*value), p.unit) + total
 
 
 def shift(p: Tuned) -> str:

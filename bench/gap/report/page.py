@@ -66,6 +66,7 @@ _CUT = {
 _FAULTY = "unknown: a unit or a sign of the recording is wrong"
 """The same where the recording is at fault."""
 _OPEN = "partial: a cause is found, but its number lies at a bound or has no interval"
+_BORDERING = "partial: a cause is found, but a parameter ends at a bound of its range"
 """The same where numbers of the causes are not results."""
 _CAPTIONS = {
     "robot": (
@@ -157,6 +158,8 @@ def _opening(story: Story) -> Iterator[str]:
         badge = _FAULTY
     elif verdict.cut is None and verdict.has_open_numbers:
         badge = _OPEN
+    elif verdict.cut is None and verdict.bordering:
+        badge = _BORDERING
     yield paragraph(f'<span class="badge">{badge}</span>')
     yield f"<h1>{safe(headline(story))}</h1>"
     for text in following(story):

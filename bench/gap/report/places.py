@@ -30,6 +30,7 @@ from bench.gap.report.words import (
 )
 from bench.gap.verdict import Cause
 from sims.extended import Number
+from sims.robot.causes import GRAVITY_COMPENSATED
 
 MOST_NAMED = 6
 """Members of a set that a sentence names; of more it says how many."""
@@ -129,6 +130,8 @@ def sized(cause: Cause) -> str:
     12 % larger than the model file says``; empty for what is no such number.
     """
     base, place = parted(cause.effect)
+    if cause.says == GRAVITY_COMPENSATED:
+        return clean(cause.says)
     if base in _STEPPED:
         return f"{_STEPPED[base]}: {clean(cause.says).rstrip('.')}"
     say = _SIZED.get(base)

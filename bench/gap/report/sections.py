@@ -148,7 +148,8 @@ def parameters(story: Story) -> Iterator[str]:
         heads.append("before above, after below")
     rows = []
     for p in story.parameters:
-        row = [safe(p.name, 60), _tuned(p, 0)]
+        # Where nothing was found the last fit is of the base model, too, and the best one.
+        row = [safe(p.name, 60), _tuned(p, 0 if extended else 1)]
         if extended:
             row += [_tuned(p, 1), safe(_move(p)), _intervals(p)]
         rows.append(row)

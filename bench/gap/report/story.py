@@ -95,7 +95,8 @@ class Profile:
 @dataclass(frozen=True)
 class Tuned:
     """A parameter before and after the extension, each with its 95 % interval (NaN where the data
-    give none), and which end of its range it lies at, before and after.
+    give none), and which end of its range it lies at, before and after; of a robot also what
+    becomes of the number of its model file.
     """
 
     name: str
@@ -104,6 +105,7 @@ class Tuned:
     after: tuple[float, float, float]
     touched: bool
     bounds: tuple[Bound | None, Bound | None] = (None, None)
+    in_file: str = ""
 
 
 @dataclass(frozen=True)

@@ -143,10 +143,29 @@ def with_unit(text: str, unit: str) -> str:
 
 
 def estimated(fitted: Number) -> str:
-    """A fitted number with its interval and its unit, or which bound it lies at."""
+    """A fitted number with its interval and its unit, or which bound it lies at; what becomes of
+    the number of the model file; and whether it is outside the usual range.
+    """
+    text = with_unit(estimate(fitted.value, fitted.low, fitted.high), fitted.unit)
     if fitted.at_bound is not None:
-        return at_bound(fitted.value, fitted.unit, fitted.at_bound)
-    return with_unit(estimate(fitted.value, fitted.low, fitted.high), fitted.unit)
+        text = at_bound(fitted.value, fitted.unit, fitted.at_bound)
+    return text + in_file(fitted) + beyond_usual(fitted)
+
+
+def in_file(fitted: Number) -> str:
+    """``, in the model file 0.2 → 0.15 N·m``; empty where the file states no such number."""
+    if fitted.stated is None or fitted.total is None:
+        return ""
+    total = with_unit(number(fitted.total), fitted.total_unit or fitted.unit)
+    return f", in the model file {number(fitted.stated)} → {total}"
+
+
+def beyond_usual(fitted: Number) -> str:
+    """``, beyond the usual range of -0.3 to 0.6 N·m·s/rad``; empty for a usual number."""
+    if fitted.usual_range is None:
+        return ""
+    low, high = map(number, fitted.usual_range)
+    return f", beyond the usual range of {with_unit(f'{low} to {high}', fitted.unit)}"
 
 
 def at_bound(value: float, unit: str, bound: str) -> str:

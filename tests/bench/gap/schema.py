@@ -29,7 +29,14 @@ def maybe(value, *bounds):
 
 
 def estimate(value):
-    assert set(value) - {"at_bound"} == {"value", "unit", "low", "high"}
+    optional = {"at_bound", "stated", "total", "total_unit", "usual_range"}
+    assert set(value) - optional == {"value", "unit", "low", "high"}
+    assert ("stated" in value) == ("total" in value)
+    for key in {"stated", "total"} & set(value):
+        number(value[key])
+    if "usual_range" in value:
+        low, high = value["usual_range"]
+        assert not low <= value["value"] <= high
     if "at_bound" in value:
         assert value["at_bound"] in ("low", "high")
         assert value["low"] is value["high"] is None

@@ -67,6 +67,13 @@ def test_a_sound_log_is_not_odd(tmp_path):
     assert refuse_odd(*load(table_of(tmp_path))) == []
 
 
+def test_a_link_without_inertia_does_not_make_the_stamps_milliseconds(tmp_path):
+    light = ARM.replace(
+        'mass="0.8" diaginertia="0.01 0.01 0.001"', 'mass="1e-7" diaginertia="1e-9 1e-9 1e-9"'
+    )
+    assert refuse_odd(*load(table_of(tmp_path, model=light))) == []
+
+
 SAID = {
     "degrees": (
         scaled(1, 1, 57.3, 57.3),

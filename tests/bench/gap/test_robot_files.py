@@ -20,7 +20,11 @@ from sims.robot.simulator import robot_simulator
 from tests.bench.gap.stories import story
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "robot"
-FRICTION = {"friction.coulomb@elbow": {"coefficient": Number(0.03, "N*m", 0.029, 0.031)}}
+FRICTION = {
+    "friction.coulomb@elbow": {
+        "coefficient": Number(0.03, "N*m", 0.029, 0.031, stated=0.0, total=0.03)
+    }
+}
 
 
 OBSERVED = ["q.shoulder", "q.elbow"]
@@ -45,7 +49,7 @@ def test_it_is_written_with_the_rest(arm, tmp_path):
     assert "friction" in line
     model = mujoco.MjModel.from_xml_path(str(paths[2]))
     assert model.dof_frictionloss.tolist() == [0.0, 0.03]
-    assert "fitted to a log" in paths[2].read_text()
+    assert "0.031), from 0 to 0.03 N*m, fitted to a log" in paths[2].read_text()
     report = paths[-1].read_text()
     assert "What to change in the model file" in report
     assert report.count('<ins class="line">') == 1

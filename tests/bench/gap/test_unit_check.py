@@ -204,6 +204,8 @@ def test_a_true_gain_near_a_conversion_is_not_a_unit():
         ("input.gain", -1.99, "[inputs.u] scale = -1"),
         ("input.gain", 1e-3 - 1, '[inputs.u] unit = "mN*m"'),
         ("sensor.gain", -0.96, None),
+        # The lower bound of the range: the fit asks for less.
+        ("sensor.gain", -0.8, None),
     ],
 )
 def test_a_fitted_gain_that_is_a_conversion_is_recognised(effect, value, line):

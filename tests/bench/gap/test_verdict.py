@@ -7,6 +7,7 @@ import pytest
 
 from bench.gap.causes.rules import MEANING
 from bench.gap.propose import Experiment
+from bench.gap.report.words import estimated
 from bench.gap.verdict import Candidate, Cause, Heldout, Verdict, finite
 from sims.extended import Number
 from tests.bench.gap import schema
@@ -93,3 +94,24 @@ def test_it_is_shown_on_a_line():
 def test_it_cannot_be_changed():
     with pytest.raises(FrozenInstanceError):
         TURN.verdict = "named"
+
+
+def test_a_number_of_a_model_file_stands_beside_its_total():
+    friction = Number(-0.05, "N*m", -0.06, -0.04, stated=0.2, total=0.15)
+    assert estimated(friction) == "−0.050 (−0.060 to −0.040) N·m, in the model file 0.2 → 0.15 N·m"
+    mass = Number(0.25, "1", 0.2, 0.3, stated=0.8, total=1.0, total_unit="kg")
+    assert estimated(mass).endswith(", in the model file 0.8 → 1 kg")
+
+
+def test_a_value_beyond_the_usual_range_is_said_and_not_hidden():
+    damping = Number(60.0, "N*m*s/rad", 59.0, 61.0, usual_range=(-0.3, 0.6))
+    assert estimated(damping).endswith("beyond the usual range of −0.3 to 0.6 N·m·s/rad")
+    assert damping.is_result
+
+
+def test_totals_and_usual_ranges_survive_a_file():
+    number = Number(2.0, "1", 1.9, 2.1, None, 0.8, 2.4, "kg", (-0.5, 0.5))
+    cause = Cause("mass.scale@fore", (), "a wrong mass", {"coefficient": number}, 1e-9)
+    document = json.loads(json.dumps(cause.document()))
+    schema.estimate(document["coefficients"]["coefficient"])
+    assert Cause.of(document) == cause

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from sims.extended import Number
 from sims.robot.checking import check, moved
 from sims.robot.reading import read
 from sims.robot.writing import Causes, written
@@ -338,3 +339,26 @@ def test_actuators_of_a_recording_are_written_into_the_file(tmp_path: Path) -> N
     model = mujoco.MjModel.from_xml_string(done.xml)
     assert model.actuator_gainprm[0, 0] == pytest.approx(6.0)
     assert any("its actuators are the recording's" in line for line in done.said)
+
+
+def test_compensated_gravity_is_written_as_such(tmp_path):
+    arm = robot(tmp_path)
+    causes = {"gravity.scale": {"coefficient": Number(-0.999, "1", -1.001, -0.997)}}
+    done = written(arm, causes, "log.csv")
+    check(arm, causes, done)
+    assert done.xml.count('gravcomp="1"') == 3
+    model = mujoco.MjModel.from_xml_string(done.xml)
+    assert model.opt.gravity.tolist() == [0.0, 0.0, -9.81]
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    # What gravity pulls with is taken away again.
+    np.testing.assert_allclose(data.qfrc_gravcomp, data.qfrc_bias, rtol=1e-9, atol=1e-12)
+    assert np.abs(data.qfrc_bias).max() > 1.0
+    assert any("gravity is compensated" in line for line in done.said)
+
+
+def test_a_gravity_that_is_only_weaker_is_scaled(tmp_path):
+    causes = {"gravity.scale": {"coefficient": Number(-0.9, "1", -0.91, -0.89)}}
+    done = written(robot(tmp_path), causes, "log.csv")
+    assert "gravcomp" not in done.xml
+    assert mujoco.MjModel.from_xml_string(done.xml).opt.gravity[2] == pytest.approx(-0.981)

@@ -1,0 +1,70 @@
+"""Recordings without sensor noise, such as simulated ones: white noise at the accuracy of a
+simulation is added before they are explained.
+
+Two exact simulations of one system differ by what their integrators neglect, 10^-9 to 10^-4 of a
+channel's range. Without noise every test would find this difference significant, and a search would
+explain the integrator. White noise of 10^-4 of the range (`floor.PRECISION`) covers it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bench.gap.model.floor import LEAST, PRECISION, range_of
+from bench.problem.seeds import rng_for
+from bench.recordings.noise import differences_sigma
+from sims.base import Array
+from sims.recording.recording import Recording, Run
+
+ORDER = 8
+"""Order of the differences that take the motion out of a smooth signal: of a sine that is sampled
+ten times a period they leave 2 %, at a hundred samples 10^-10.
+"""
+FREE = 0.02
+"""A channel has no noise if the rest is below this share of the noise that would be added. Rounding
+to six digits is below it.
+"""
+
+
+def add_least_noise(recording: Recording, channels: Sequence[str]) -> tuple[Recording, list[str]]:
+    """Add white noise of `PRECISION` of a channel's range to each channel without noise.
+
+    Channels that never change are left as they are.
+
+    Returns:
+        The recording, and the names of the channels that were changed.
+    """
+    changed = {name: size for name in channels if (size := _missing(recording, name)) > 0.0}
+    if not changed:
+        return recording, []
+    runs = tuple(_noisy(run, changed) for run in recording.runs)
+    return replace(recording, runs=runs), list(changed)
+
+
+def _missing(recording: Recording, name: str) -> float:
+    """1 sigma of the noise that a channel lacks; 0 where it has noise, or is constant."""
+    signals = [(run.times, run.channels[name]) for run in recording.runs if name in run.channels]
+    values = np.concatenate([y[np.isfinite(y)] for _, y in signals])
+    least = PRECISION * range_of(values)
+    if least < LEAST:
+        return 0.0
+    # Unknown where all runs are shorter than a difference.
+    return least if differences_sigma(signals, ORDER) < FREE * least else 0.0
+
+
+def _noisy(run: Run, sizes: dict[str, float]) -> Run:
+    """The run with white noise in some channels; the same for the same run and channel."""
+
+    def noise(name: str, values: Array) -> Array:
+        return sizes[name] * rng_for("least noise", run.log, run.name, name).normal(
+            size=values.shape
+        )
+
+    channels = {
+        name: values + noise(name, values) if name in sizes else values
+        for name, values in run.channels.items()
+    }
+    return replace(run, channels=channels)

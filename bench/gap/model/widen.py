@@ -1,0 +1,146 @@
+"""Wider ranges for base parameters that a fit leaves at a bound of their range.
+
+A declared range is a guess of what is usual. Where the best value lies beyond it, the base model is
+wrong, and an effect of the library would be fitted to the difference. So the range is widened as
+far as physics allows, and the base model is fitted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bench.gap.model.base_fit import LAST_STEPS, Base
+from bench.gap.model.bounds import BEYOND_MODEL, bound_of
+from bench.gap.model.fit import Fitter
+from bench.gap.model.noise import Noise
+from bench.gap.model.world import World
+from sims.base import Array, Parameter
+
+Bounds = tuple[float, float]
+
+FACTOR = 4.0
+"""A range becomes this many times as wide in one round."""
+ROUNDS = 5
+"""Maximum number of rounds: the range is then a thousand times as wide."""
+
+
+def at_bounds(world: World, base: Base) -> list[int]:
+    """Places of fitted base parameters that lie at a bound beyond which physics allows values."""
+    places = []
+    for i in world.base.tolist():
+        if i in base.frozen:
+            continue
+        low, high = world.parameters[i].bounds
+        end = bound_of(float(base.fit.theta[i]), low, high)
+        lower, upper = widened(world.parameters[i], limits_of(world, i))
+        if (end == "low" and lower < low) or (end == "high" and upper > high):
+            places.append(i)
+    return places
+
+
+def fit_wider(world: World, noise: Noise, base: Base) -> tuple[Base, dict[str, Bounds]]:
+    """Widen the ranges of parameters at a bound, and fit the base model again.
+
+    Args:
+        world: the runs for fitting; the ranges of its parameters are replaced.
+        noise: of each channel.
+        base: the fitted base model.
+
+    Returns:
+        The base model, and the new ranges by name; empty where nothing lies at a bound.
+    """
+    found: dict[str, Bounds] = {}
+    for _ in range(ROUNDS):
+        places = at_bounds(world, base)
+        if not places or world.watch.left():
+            break
+        for i in places:
+            parameter = world.parameters[i]
+            found[parameter.name] = widened(parameter, limits_of(world, i))
+        use_bounds(world, found)
+        fit = Fitter(world, noise, base.frozen).fit([base.fit.start()], LAST_STEPS)[0]
+        base = replace(base, fit=fit)
+    return base, found
+
+
+def use_bounds(world: World, found: Mapping[str, Bounds]) -> None:
+    """Let the parameters of a world have these ranges."""
+    if not found:
+        return
+    world.parameters = tuple(
+        replace(p, bounds=found[p.name], training=None) if p.name in found else p
+        for p in world.parameters
+    )
+    # Processes that were forked before have the narrow ranges.
+    world.crew.forget(world)
+
+
+def limits_of(world: World, place: int) -> Bounds:
+    """What is physically possible of a base parameter: for a robot, what its total allows."""
+    parameter = world.parameters[place]
+    if world.kind.has_model:
+        coefficient = _coefficient(world.kind, parameter.name)
+        if coefficient is not None:
+            least, most = coefficient.least, coefficient.most
+            return (
+                -np.inf if least is None else least,
+                BEYOND_MODEL * coefficient.plausible[0][1] if most is None else most,
+            )
+    return _limits(parameter)
+
+
+def _coefficient(kind: Any, name: str) -> Any:
+    """The coefficient of a robot's effect that a freed parameter is; None of any other."""
+    for effect in kind.system.freed_effects:
+        for c in effect.coefficients:
+            if name in (effect.name, f"{effect.name}.{c.name}"):
+                return c
+    return None
+
+
+def _limits(parameter: Parameter) -> Bounds:
+    """What is possible of a declared parameter by its unit and its range: what is never negative
+    stays so, and a share is at most 1.
+    """
+    low, high = parameter.bounds
+    share = parameter.unit == "1" and low >= 0.0 and high <= 1.0
+    return 0.0 if low >= 0.0 else -np.inf, 1.0 if share else np.inf
+
+
+def widened(parameter: Parameter, limits: Bounds) -> Bounds:
+    """The next wider range of a parameter within its physical limits."""
+    low, high = parameter.bounds
+    width = high - low
+    # What is positive stays positive: its range grows by a factor to either side.
+    lower = low / FACTOR if low > 0.0 else low - (FACTOR - 1.0) * width * (low < 0.0)
+    upper = high * FACTOR if low >= 0.0 else high + (FACTOR - 1.0) * width
+    return max(lower, min(limits[0], low)), min(upper, max(limits[1], high))
+
+
+def outside(world: World, theta: Array, wider: Mapping[str, tuple[Bounds, Bounds]]) -> list[str]:
+    """A sentence for each parameter of a fitted model that lies outside its declared range.
+
+    Args:
+        world: the runs for fitting.
+        theta: (P,) the fitted parameters.
+        wider: by name of a parameter, its declared range and the wider one that it was given.
+    """
+    sentences = []
+    for i in world.base.tolist():
+        parameter, value = world.parameters[i], float(theta[i])
+        if parameter.name not in wider:
+            continue
+        (low, high), (wide_low, wide_high) = wider[parameter.name]
+        if low <= value <= high:
+            continue
+        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+        sentences.append(
+            f"{parameter.name} = {value:.4g}{unit} lies outside its usual range, {low:g} to "
+            f"{high:g}{unit}; the range was widened to {wide_low:g} to {wide_high:g}{unit}. "
+            "Check the units and constants of the recording"
+        )
+    return sentences

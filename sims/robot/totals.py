@@ -1,0 +1,126 @@
+"""The number of the model file that a coefficient changes: what the file states, and the total with
+the coefficient in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sims.robot.model import Robot
+from sims.robot.native import FIELDS
+from sims.robot.stated import Fields, fields
+from sims.system import Effect
+
+
+class Total(NamedTuple):
+    """A number of the model file before and after, and its unit."""
+
+    stated: float
+    total: float
+    unit: str
+
+
+Read = Callable[[Fields, Robot, str], Sequence[float]]
+"""The numbers that an effect's coefficients change, in their order: of the fields, at a place."""
+
+
+def _joint(field: str, *index: int) -> Read:
+    return lambda f, r, place: [f[field][(0, r.joint(place).velocity, *index)]]
+
+
+def _spring(field: str, *index: int) -> Read:
+    return lambda f, r, place: [f[field][(0, r.joint(place).id, *index)]]
+
+
+def _servo(term: int) -> Read:
+    return lambda f, r, place: [-f["actuator_biasprm"][0, r.actuator(place).id, term]]
+
+
+def _strength(f: Fields, robot: Robot, place: str) -> Sequence[float]:  # noqa: ARG001
+    """Gravity along the direction that the file states."""
+    stated = robot.compiled.opt.gravity
+    return [float(f["opt.gravity"][0] @ stated / max(np.linalg.norm(stated), 1e-300))]
+
+
+def _limit(f: Fields, robot: Robot, place: str) -> Sequence[float]:
+    number = robot.actuator(place).id
+    limited = f["actuator_forcelimited"][0, number]
+    return [f["actuator_forcerange"][0, number, 1]] if limited else [np.inf]
+
+
+class Reading(NamedTuple):
+    """How a total is read, and its units on a hinge and on a slide; empty for the coefficient's."""
+
+    read: Read
+    hinge: str = ""
+    slide: str = ""
+
+
+_TOTALS: Mapping[str, Reading] = {
+    "drag.linear": Reading(_joint("dof_damping")),
+    "drag.quadratic": Reading(_joint("dof_dampingpoly", 0)),
+    "friction.coulomb": Reading(_joint("dof_frictionloss")),
+    "inertia.armature": Reading(_joint("dof_armature")),
+    "spring.linear": Reading(_spring("jnt_stiffness")),
+    "spring.cubic": Reading(_spring("jnt_stiffnesspoly", 1)),
+    "actuator.limit": Reading(_limit),
+    "actuator.stiffness": Reading(_servo(1), "N*m/rad", "N/m"),
+    "actuator.damping": Reading(_servo(2), "N*m*s/rad", "N*s/m"),
+    "mass.scale": Reading(lambda f, r, place: [f["body_mass"][0, r.body(place).id]], "kg"),
+    "mass.offset": Reading(lambda f, r, place: f["body_ipos"][0, r.body(place).id]),
+    # Of three principal moments the largest.
+    "inertia.scale": Reading(
+        lambda f, r, place: [np.max(f["body_inertia"][0, r.body(place).id])], "kg*m^2"
+    ),
+    "gravity.scale": Reading(_strength, "m/s^2"),
+    "gravity.tilt": Reading(lambda f, *_: f["opt.gravity"][0, :2], "m/s^2"),
+}
+
+
+Fitted = Sequence[tuple[type[Effect], Sequence[float]]]
+"""Effects at one place each, or of the world, with their coefficients."""
+
+
+def totals(robot: Robot, fitted: Fitted) -> list[list[Total | None]]:
+    """Return what becomes of the numbers of the model file when all effects are in it, by effect
+    and coefficient; None where the file states no such number.
+
+    The mass and the inertia of one body may both be wrong: a total has what all effects make of it.
+    """
+    stated, after = fields(robot.compiled), fields(robot.compiled)
+    for effect, values in fitted:
+        if _name(effect) in _TOTALS:
+            c = np.array(values, dtype=float)[:, None]
+            FIELDS[_name(effect)].write(after, robot, effect.place, c)
+    return [_totals(robot, effect, len(values), stated, after) for effect, values in fitted]
+
+
+def _name(effect: type[Effect]) -> str:
+    return effect.of or effect.name
+
+
+def _totals(
+    robot: Robot, effect: type[Effect], count: int, stated: Fields, after: Fields
+) -> list[Total | None]:
+    """The totals of one effect."""
+    if _name(effect) not in _TOTALS:
+        return [None] * count
+    reading = _TOTALS[_name(effect)]
+    found: list[Total | None] = []
+    pairs = (np.array(reading.read(f, robot, effect.place), dtype=float) for f in (stated, after))
+    for c, before, total in zip(effect.coefficients, *pairs, strict=True):
+        unit = (reading.slide if _slides(robot, effect) else "") or reading.hinge or c.units[0]
+        known = np.isfinite([before, total]).all()
+        found.append(Total(float(before), float(total), unit or "1") if known else None)
+    return found
+
+
+def _slides(robot: Robot, effect: type[Effect]) -> bool:
+    """Whether an effect acts at an actuator of a joint that slides."""
+    if effect.at != "actuator":
+        return False
+    joint = robot.actuator(effect.place).joint
+    return joint is not None and robot.joint(joint).kind == "slide"
