@@ -20,7 +20,6 @@ from sims.robot.floating import Afloat, Floating
 from sims.robot.midway import Look, Mask, Midway, Places
 from sims.robot.model import Robot
 from sims.robot.native import COUPLING, FIELDS, SOLIMP, lanes_spec, stiff_of
-from sims.robot.quiet import quiet
 from sims.robot.series import FIELDS as SERIES
 from sims.robot.series import WRITTEN, hung, is_series, press
 from sims.robot.series import write as in_series
@@ -93,8 +92,7 @@ def read_model(robot: Robot, derived: bool) -> Any:
                 objtype=mujoco.mjtObj.mjOBJ_JOINT,
                 objname=joint.name,
             )
-    with quiet():
-        return spec.compile()
+    return robot.compile(spec)
 
 
 def drives(model: Any, robot: Robot) -> dict[str, int]:

@@ -13,6 +13,7 @@ from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
 import numpy as np
 
 from sims.base import InputError, unknown
+from sims.robot.collision_hulls import CollisionShapes
 from sims.robot.quiet import quiet
 
 Format = Literal["mjcf", "urdf"]
@@ -131,6 +132,7 @@ class Robot:
         series: of joints that were put in series with others (`sims.robot.series`), by name, the
             inertia about them, kg or kg m^2; no other joint is in this model alone.
         coupled: joints whose drives turn the joint before as well (`sims.robot.coupled`).
+        shapes: what is written into its compiled models, where their meshes are convex hulls.
         kept: what functions `kept_with_robot` found of it.
     """
 
@@ -146,13 +148,21 @@ class Robot:
     speeds: Mapping[str, float] = field(default_factory=dict)
     series: Mapping[str, float] = field(default_factory=dict)
     coupled: tuple[str, ...] = ()
+    shapes: CollisionShapes | None = None
     kept: dict[tuple[Any, ...], Any] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def compiled(self) -> Any:
         """The mujoco.MjModel; nobody writes into it."""
+        return self.compile(self.spec)
+
+    def compile(self, spec: Any) -> Any:
+        """Compile a spec of this robot, a mujoco.MjSpec."""
         with quiet():
-            return self.spec.compile()
+            model = spec.compile()
+        if self.shapes is not None:
+            self.shapes.write(model)
+        return model
 
     @property
     def name(self) -> str:

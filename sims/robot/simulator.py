@@ -31,6 +31,7 @@ from sims.robot.numerics import INTEGRATORS, Numerics, RobotEngine, own_numerics
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
 from sims.robot.series import Added, by_series, in_series
+from sims.robot.simulation_model import strip_assets
 from sims.robot.system import RobotSystem, system_of
 from sims.robot.work import Given, Made, Start, Work, by_run, instants
 from sims.simulated import Simulated
@@ -326,7 +327,8 @@ class RobotSimulator(Simulated):
         if key not in self._benches:
             engine = self.engine
             assert isinstance(engine, RobotEngine)
-            robot = in_series(self.robot, series) if series else self.robot
+            robot = strip_assets(self.robot)
+            robot = in_series(robot, series) if series else robot
             self._benches[key] = Bench(robot, derived, engine.numerics.settings(), count)
         return self._benches[key]
 
