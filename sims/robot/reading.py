@@ -84,11 +84,11 @@ def _robot(
     added.set_engine(spec, engine, source)
     notes += names.given(spec)
     above = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
-    model = mends.compiled(spec)
+    spec, model = mends.compiled(spec)
     _check(files, model)
     further = contacts.without(spec, model) if kind == "urdf" else []
     if further:
-        model = mends.compiled(spec)
+        spec, model = mends.compiled(spec)
     aliases = _fused(above, {model.body(i).name for i in range(model.nbody)})
     said = [f"MuJoCo says: {warning}" for warning in dict.fromkeys(warnings)]
     if model.nu == 0:

@@ -24,6 +24,7 @@ from sims.robot.collision_hulls import (
 )
 from sims.robot.coupled import named
 from sims.robot.model import Robot, kept_with_robot
+from sims.robot.quiet import quiet
 
 RAYS = frozenset(
     f"mjSENS_{name}"
@@ -69,9 +70,11 @@ def strip_assets(robot: Robot) -> Robot:
     if _needs_shapes(model):
         return robot
     spec = robot.spec.copy()
-    named(spec, robot)
+    with quiet():
+        spec.compile()  # which numbers its elements
     _state_inertials(spec, model)
     hulls, numbers = _reduce_geoms(spec, model)
+    named(spec, robot)
     spec.discard_visual()
     spec.compiler.discardvisual = False
     used = {geom.hfieldname for geom in spec.geoms}
