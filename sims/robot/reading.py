@@ -12,6 +12,7 @@ import numpy as np
 
 from sims.base import InputError
 from sims.limits import LARGEST, cut
+from sims.memory import release_free_memory
 from sims.robot import added, contacts, mjcf, names, urdf
 from sims.robot.mends import Mends
 from sims.robot.model import Format, Robot
@@ -108,6 +109,8 @@ def _robot(
         speeds=urdf.speeds(root) if kind == "urdf" else {},
     )
     robot.__dict__["compiled"] = model  # which it would compile anew
+    if model.nmesh:
+        release_free_memory()
     return robot
 
 

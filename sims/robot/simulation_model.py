@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sims.memory import release_free_memory
 from sims.robot import contacts
 from sims.robot.collision_hulls import (
     MIN_FACES,
@@ -66,9 +67,21 @@ def strip_assets(robot: Robot) -> Robot:
         The robot with a smaller spec, which moves alike to the last bit; the robot itself where
         that cannot be had.
     """
+    import mujoco
+
     model = robot.compiled
     if _needs_shapes(model):
         return robot
+    stripped = _stripped(robot)
+    # MuJoCo keeps all meshes that it has read, for specs that may name them again.
+    mujoco.mj_clearCache(mujoco.mj_getCache())
+    release_free_memory()
+    return stripped
+
+
+def _stripped(robot: Robot) -> Robot:
+    """See `strip_assets`."""
+    model = robot.compiled
     spec = robot.spec.copy()
     with quiet():
         spec.compile()  # which numbers its elements
