@@ -170,6 +170,12 @@ class Bench:
         """The mujoco.MjModel that lanes share but for their fields."""
         return self.batch.model
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the model that the batch copies, and of the lanes' own fields and states."""
+        own = [*self.fields.values(), *self._stated.values(), self.batch.state]
+        return int(self.model.nbuffer) + sum(values.nbytes for values in own)
+
     def load(self, acting: Acting) -> None:
         """Write the native effects, with coefficients (K, LANES, 1), into the lanes' fields."""
         for name in self._changed:

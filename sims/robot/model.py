@@ -154,7 +154,8 @@ class Robot:
     @cached_property
     def compiled(self) -> Any:
         """The mujoco.MjModel; nobody writes into it."""
-        return self.compile(self.spec)
+        # A spec that has been compiled holds all meshes once more.
+        return self.compile(self.spec.copy())
 
     def compile(self, spec: Any) -> Any:
         """Compile a spec of this robot, a mujoco.MjSpec."""

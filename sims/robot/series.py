@@ -100,7 +100,6 @@ def by_series(acting: Acting, count: int) -> dict[Added, list[int]]:
     return lanes
 
 
-@kept_with_robot
 def in_series(robot: Robot, added: Added) -> Robot:
     """The robot with more joints; elements keep the names that the robot has for them.
 

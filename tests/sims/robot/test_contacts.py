@@ -6,6 +6,7 @@ import pytest
 
 from bench.registry import robot
 from sims.base import Scenario
+from sims.robot.bench_cache import bench_cache
 from sims.robot.contacts import possible
 
 MODEL = """<mujoco>{option}<worldbody>{floor}
@@ -61,7 +62,7 @@ def test_only_contacts_that_cannot_be_are_not_looked_for(tmp_path):
         path.write_text(ARM.format(floor=shape))
         simulator = robot(path)(observe=["q.shoulder"])
         found[name] = simulator.simulate(np.zeros((1, len(simulator.parameters))), scenario)
-        (bench,) = simulator._benches.values()
+        (bench,) = bench_cache(simulator.robot).benches
         off = bool(bench.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT)
         assert off == (name == "none")
     np.testing.assert_array_equal(found["none"], found["far"])
