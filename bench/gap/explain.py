@@ -178,8 +178,7 @@ class _Explainer:
         for odd in refuse_odd(self.recording, kind, force):
             say(f"{self.path}: {odd}")
         self.recording, note = cut(self.recording, kind, subject.pieces, subject.whole)
-        self.notes = (note,) if note else ()
-        for note in self.notes:
+        if note:
             say(note)
         check_recording(self.recording, kind(engine=self.engine), force)
         self.watch = watch
@@ -187,6 +186,12 @@ class _Explainer:
         self.thorough = thorough
         self.free = tuple(free)
         self._enter(kind)
+        left_out = [
+            f"{effect} is not tested: {why}" for effect, why in kind.system.left_out.items()
+        ]
+        for line in left_out:
+            say(line)
+        self.notes = (*((note,) if note else ()), *left_out)
         self.coarse: Coarse | None = None
         self.found: tuple[Search, Finding] | None = None
         self.faults: tuple[RecordingFault, ...] = ()

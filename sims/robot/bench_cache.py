@@ -7,11 +7,13 @@ own, and most candidates are asked for once.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from sims.robot.lanes import Bench
 from sims.robot.model import Robot, kept_with_robot
+from sims.robot.quiet import one_line
 from sims.robot.series import Added, in_series
 from sims.robot.simulation_model import strip_assets
 
@@ -19,6 +21,10 @@ CACHE_BYTES = 96 << 20
 """Memory that the models with joints in series may take, in bytes; the ones that have not been
 asked for longest are dropped beyond it. The robot's own model does not count.
 """
+
+
+class RefusedModelError(Exception):
+    """MuJoCo does not compile a model with joints in series: names the effects and its reason."""
 
 
 @dataclass
@@ -48,6 +54,7 @@ class BenchCache:
         self._limit = limit
         self._own = _Variant(strip_assets(robot))
         self._series: dict[Added, _Variant] = {}
+        self._refused: dict[Added, str] = {}
 
     @property
     def benches(self) -> list[Bench]:
@@ -67,14 +74,27 @@ class BenchCache:
             settings: options of the model, as `sims.robot.lanes.Bench` takes them.
 
         Raises:
-            ValueError: MuJoCo refuses the model, in its own words.
+            RefusedModelError: MuJoCo refuses the model with these joints in series.
         """
-        variant = self._variant(series)
+        if series in self._refused:
+            raise RefusedModelError(self._refused[series])
         key = (derived, count, *settings.values())
-        if key not in variant.benches:
-            variant.benches[key] = Bench(variant.robot, derived, settings, count)
-            self._trim()
-        return variant.benches[key]
+        try:
+            variant = self._variant(series)
+            if key not in variant.benches:
+                variant.benches[key] = Bench(variant.robot, derived, settings, count)
+                self._trim()
+            return variant.benches[key]
+        except ValueError as error:
+            if not series:
+                raise
+            effects = ", ".join(
+                f"{effect}@{place}" if place else effect for place, effect in series
+            )
+            said = f"{effects}: MuJoCo does not compile the model: {one_line(error)}"
+            self._refused[series] = said
+            sys.stderr.write(f"simgap: not simulated: {said}\n")
+            raise RefusedModelError(said) from None
 
     def _variant(self, series: Added) -> _Variant:
         if not series:

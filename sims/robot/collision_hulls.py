@@ -34,7 +34,7 @@ RESERVE = "simgap.reserve"
 """Name of the mesh that makes room for graphs and polygons that are copied into a model."""
 
 MEASURED = ("geom_size", "geom_aabb", "geom_rbound")
-"""Fields of a geom that MuJoCo computes from vertices in double precision, before it rounds them."""
+"""Fields of a geom that MuJoCo computes from vertices before it rounds them to single precision."""
 
 Integers = NDArray[np.int32]
 
@@ -237,7 +237,8 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
 def _sizes(hulls: Iterable[Hull]) -> Array:
     """(3,) integers of graphs, number of polygons and number of their corners, of all together."""
     sizes = [(h.graph.size, h.polygons.sizes.size, h.polygons.values.size) for h in hulls]
-    return np.sum(np.array(sizes, dtype=float).reshape(-1, 3), axis=0)
+    total: Array = np.sum(np.array(sizes, dtype=float).reshape(-1, 3), axis=0)
+    return total
 
 
 def _gather(values: Integers, begins: Integers, sizes: Integers) -> Lists:

@@ -174,7 +174,7 @@ class Bench:
     def nbytes(self) -> int:
         """Bytes of the model that the batch copies, and of the lanes' own fields and states."""
         own = [*self.fields.values(), *self._stated.values(), self.batch.state]
-        return int(self.model.nbuffer) + sum(values.nbytes for values in own)
+        return int(self.model.nbuffer + sum(values.nbytes for values in own))
 
     def load(self, acting: Acting) -> None:
         """Write the native effects, with coefficients (K, LANES, 1), into the lanes' fields."""

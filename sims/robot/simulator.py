@@ -18,7 +18,7 @@ from sims import effects as library
 from sims.base import Array, InputError, Scenario, unknown
 from sims.plan import Runs, make_runs
 from sims.robot.acting import derives, filled, is_asked, lanes_with, natives, part_of
-from sims.robot.bench_cache import bench_cache
+from sims.robot.bench_cache import RefusedModelError, bench_cache
 from sims.robot.compiled import compiled
 from sims.robot.drives import Shown
 from sims.robot.felt import INSTANT, SHARE
@@ -161,7 +161,11 @@ class RobotSimulator(Simulated):
                         for run, own in by_run(runs, part)
                     ]
                     bits = bool(kind & 1), bool(kind & 2)
-                    done = self._simulate(works, part_of(acting, part), *bits, series)
+                    try:
+                        done = self._simulate(works, part_of(acting, part), *bits, series)
+                    except RefusedModelError:
+                        # Its lanes stay NaN, as those of a motion that explodes; the rest goes on.
+                        continue
                     for (_, own), seen in zip(by_run(runs, part), done, strict=True):
                         result[own, : seen.shape[1]] = seen
         result += 0.0  # no zero is negative: whatever made it, it is the same zero
