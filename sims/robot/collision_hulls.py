@@ -31,7 +31,15 @@ CORE_FACES = (
 )  # fmt: skip
 """Triangles of a box whose corners are numbered by the signs of x, y and z."""
 RESERVE = "simgap.reserve"
-"""Name of the mesh that makes room for graphs and polygons that are copied into a model."""
+"""Beginning of the names of meshes that make room for hulls that are copied into a model."""
+LARGEST = ("npolygonmax", "nmeshdegmax")
+"""Sizes of a model by which MuJoCo reserves buffers: most corners of a polygon, and most polygons
+at a vertex.
+"""
+TESTED = "4.0."
+"""Beginning of the versions of MuJoCo whose compiled meshes are known to be what `write_hulls`
+writes; with others, meshes that collide stay as they are.
+"""
 
 MEASURED = ("geom_size", "geom_aabb", "geom_rbound")
 """Fields of a geom that MuJoCo computes from vertices before it rounds them to single precision."""
@@ -179,26 +187,45 @@ def add_hull(spec: Any, name: str, hull: Hull) -> None:
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT
 
 
-def add_reserve(spec: Any, model: Any, hulls: Mapping[str, Hull]) -> None:
-    """Add a mesh that makes room in compiled models for `write_hulls`, where there is too little.
+def add_reserve(spec: Any, model: Any, whole: Any, hulls: Mapping[str, Hull]) -> None:
+    """Add meshes that make room in compiled models for `write_hulls`, where there is too little.
 
     Args:
         spec: with the meshes of `add_hull`.
         model: that is compiled of it.
+        whole: the model with the whole meshes.
         hulls: by the name of the mesh.
     """
     found = [read_hull(model, model.mesh(name).id) for name in hulls]
     lacking = _sizes(hulls.values()) - _sizes(hull for hull in found if hull)
-    if lacking.max() <= 0:
-        return
-    # A hull of n vertices in general position has 2 n - 4 triangles, and so 15 n - 22 integers in
-    # its graph, 2 n - 4 polygons and 6 n - 12 corners.
-    count = int(np.max(lacking / (15, 2, 6))) + 8
-    height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
-    turn = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
-    ring = np.sqrt(1.0 - height**2)
-    sphere = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
-    spec.add_mesh(name=RESERVE, uservert=sphere.ravel())
+    if lacking.max() > 0:
+        # A hull of n vertices in general position has 2 n - 4 triangles, and so 15 n - 22 integers
+        # in its graph, 2 n - 4 polygons and 6 n - 12 corners; MuJoCo merges some of them.
+        count = int(1.5 * np.max(lacking / (15, 2, 6))) + 8
+        height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
+        x, y = np.sqrt(1.0 - height**2) * _turns(np.arange(count) * np.pi * (3.0 - np.sqrt(5.0)))
+        sphere = np.stack([x, y, height], axis=1)
+        spec.add_mesh(name=f"{RESERVE}.sphere", uservert=sphere.ravel())
+    if any(getattr(model, size) < getattr(whole, size) for size in LARGEST):
+        # The base of a pyramid is a polygon with as many corners as there are sides at its top.
+        count = 8 + max(getattr(whole, size) for size in LARGEST)
+        x, y = _turns(2.0 * np.pi * np.arange(count) / count)
+        base = np.stack([x, y, np.zeros(count)], axis=1)
+        pyramid = np.concatenate([base, [[0.0, 0.0, 1.0]]])
+        spec.add_mesh(name=f"{RESERVE}.pyramid", uservert=pyramid.ravel())
+
+
+def _turns(angles: Array) -> Array:
+    """(2, n) cosines and sines."""
+    return np.stack([np.cos(angles), np.sin(angles)])
+
+
+def has_room(model: Any, whole: Any) -> bool:
+    """Whether the buffers that MuJoCo reserves for contacts of a model are as large as those for
+    the model with the whole meshes; without room it would write beyond them.
+    """
+    sizes = [name for name in dir(whole) if name.startswith("n") and name.endswith("max")]
+    return all(getattr(model, name) >= getattr(whole, name) for name in sizes)
 
 
 def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
@@ -215,7 +242,7 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
     for i, (name, hull) in enumerate(zip(names, wanted, strict=True)):
         model.mesh_graphadr[i] = -1
         model.mesh_polyadr[i], model.mesh_polynum[i] = polygon, 0
-        if hull is None or name == RESERVE:
+        if hull is None or name.startswith(RESERVE):
             continue
         model.mesh_graphadr[i] = graph
         model.mesh_extrema[i] = hull.extrema

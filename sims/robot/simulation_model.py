@@ -17,10 +17,12 @@ from sims.memory import release_free_memory
 from sims.robot import contacts
 from sims.robot.collision_hulls import (
     MIN_FACES,
+    TESTED,
     CollisionShapes,
     Hull,
     add_hull,
     add_reserve,
+    has_room,
     read_hull,
 )
 from sims.robot.coupled import named
@@ -72,7 +74,11 @@ def strip_assets(robot: Robot) -> Robot:
     model = robot.compiled
     if _needs_shapes(model):
         return robot
-    stripped = _stripped(robot)
+    try:
+        stripped = _stripped(robot)
+    # Whatever MuJoCo's compiler says of the smaller model: the whole one has compiled.
+    except (ValueError, RuntimeError):
+        stripped = robot
     # MuJoCo keeps all meshes that it has read, for specs that may name them again.
     mujoco.mj_clearCache(mujoco.mj_getCache())
     release_free_memory()
@@ -80,7 +86,11 @@ def strip_assets(robot: Robot) -> Robot:
 
 
 def _stripped(robot: Robot) -> Robot:
-    """See `strip_assets`."""
+    """Leave out of a robot's model what does not move it, see `strip_assets`.
+
+    Raises:
+        ValueError: MuJoCo refuses the smaller model.
+    """
     model = robot.compiled
     spec = robot.spec.copy()
     with quiet():
@@ -95,18 +105,15 @@ def _stripped(robot: Robot) -> Robot:
     for asset in [*spec.skins, *unused]:
         spec.delete(asset)
     stripped = replace(robot, spec=spec)
-    try:
-        if hulls:
-            add_reserve(spec, stripped.compile(spec), hulls)
-            geoms = {geom.name: numbers[geom.name] for geom in spec.geoms if geom.meshname in hulls}
-            stripped = replace(stripped, shapes=CollisionShapes.read(model, hulls, geoms))
-        alike = _moves_alike(model, stripped.compiled, numbers)
-        if alike and hulls:
-            alike = _touches_alike(robot, stripped.compiled, numbers)
-        return stripped if alike else robot
-    # Whatever MuJoCo's compiler says of the smaller model: the whole one has compiled.
-    except ValueError:
-        return robot
+    if hulls:
+        add_reserve(spec, stripped.compile(spec), model, hulls)
+        geoms = {geom.name: numbers[geom.name] for geom in spec.geoms if geom.meshname in hulls}
+        stripped = replace(stripped, shapes=CollisionShapes.read(model, hulls, geoms))
+    alike = _moves_alike(model, stripped.compiled, numbers)
+    if alike and hulls:
+        alike = has_room(stripped.compiled, model)
+        alike = alike and _touches_alike(robot, stripped.compiled, numbers)
+    return stripped if alike else robot
 
 
 @kept_with_robot
@@ -171,6 +178,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
     import mujoco
 
     touching = contacts.touching(model)
+    known = mujoco.__version__.startswith(TESTED)
     hulls: dict[str, Hull] = {}
     numbers: dict[str, int] = {}
     # A spec forgets these numbers when it is edited.
@@ -186,7 +194,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
         kind = mujoco.mjtGeom(int(model.geom_type[i]))
         if kind != mujoco.mjtGeom.mjGEOM_MESH:
             geom.type, geom.size, geom.meshname = kind, model.geom_size[i], ""
-        elif touching[i] and model.mesh_facenum[mesh] > MIN_FACES:
+        elif known and touching[i] and model.mesh_facenum[mesh] > MIN_FACES:
             hull = hulls.get(geom.meshname) or read_hull(model, mesh)
             if hull is None:
                 continue
