@@ -239,6 +239,8 @@ class System(ABC):
         levels: states that are stores, such as a tank's level: they may spill over.
         usual_recording: what its simulated recordings show where the user does not say.
         derived: numbers that follow from others, for a data sheet.
+        left_out: effects that it would have and cannot simulate, with the reason, by name. Whatever
+            asks for all effects (`sims.effects.library`) fills it.
     """
 
     name: ClassVar[str]
@@ -264,6 +266,7 @@ class System(ABC):
     levels: ClassVar[tuple[str, ...]] = ()
     usual_recording: ClassVar[UsualRecording] = UsualRecording()
     derived: ClassVar[tuple[Derived, ...]] = ()
+    left_out: ClassVar[dict[str, str]] = {}
 
     @classmethod
     def reading(cls, observed: Sequence[str]) -> str:

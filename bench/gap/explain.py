@@ -240,6 +240,12 @@ class _Explainer:
         # By name the declared range of a base parameter and the wider one that it was given.
         self.wider: dict[str, tuple[Bounds, Bounds]] = {}
         self._enter(kind)
+        left_out = [
+            f"{effect} is not tested: {why}" for effect, why in kind.system.left_out.items()
+        ]
+        for line in left_out:
+            say(line)
+        self.notes = (*((note,) if note else ()), *left_out)
         self.coarse: Coarse | None = None
         # Finer steps that differ from the file's, and the worlds of the file's where one is used.
         self.finer: Reusable[Finer] | None = None

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sims.extended import Extended, Number
+from sims.memory import release_free_memory
 
 if TYPE_CHECKING:
     from sims.robot.writing import Written
@@ -40,6 +41,8 @@ def robot_files(extended: Extended) -> RobotFiles:
     from sims.robot.markup import without_heading
     from sims.robot.writing import written
 
+    # Models with all meshes are compiled several times: what the search has left makes room.
+    release_free_memory()
     causes, left_out = written_causes(causes_of(extended))
     done = written(kind.robot, causes, extended.title)
     try:

@@ -14,12 +14,14 @@ import numpy as np
 
 from sims import effects as library
 from sims.extended import Number
+from sims.memory import release_free_memory
 from sims.robot.causes import Cause, is_gravity_compensated, one_by_one
 from sims.robot.commands import COMMANDS, order
 from sims.robot.coupled import EFFECT as COUPLED
 from sims.robot.coupled import coupled
 from sims.robot.model import Robot
 from sims.robot.native import FIELDS
+from sims.robot.precise import saved
 from sims.robot.series import element, gives, in_series, is_series, second_of, together, with_flanks
 from sims.robot.series import state as state_element
 from sims.robot.stated import (
@@ -71,7 +73,7 @@ class Applied:
 
     Attributes:
         robot: it, with joints in series where causes put some.
-        spec: the mujoco.MjSpec.
+        text: it as MJCF, as MuJoCo writes it.
         model: that, compiled.
         wanted: what the compiled model is to say of every element.
         comments: by element, the causes that change it.
@@ -80,7 +82,7 @@ class Applied:
     """
 
     robot: Robot
-    spec: Any
+    text: str
     model: Any
     wanted: Fields
     comments: Mapping[Element, Sequence[str]]
@@ -139,7 +141,11 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
         # What a limit takes for a spring hangs on all that acts.
         robot = with_flanks(robot, series, model)
         spec, model = _compiled(robot, wanted)
-    return Applied(robot, spec, model, wanted, comments, tuple(held), tuple(said))
+    # The text alone: a compiled spec holds all meshes a second time.
+    text = saved(spec, robot.path.resolve().parent)
+    del spec
+    release_free_memory()
+    return Applied(robot, text, model, wanted, comments, tuple(held), tuple(said))
 
 
 def _note(robot: Robot, effect: str) -> str | None:

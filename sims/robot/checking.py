@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sims.base import Array
+from sims.memory import release_free_memory
 from sims.robot.causes import one_by_one
 from sims.robot.changes import apply
 from sims.robot.inertia import LEAST
@@ -43,19 +44,25 @@ def check(robot: Robot, causes: Causes, done: Written) -> None:
     Raises:
         RuntimeError: a number or the motion differs; names the field. A fault of the program.
     """
-    import mujoco
-
     with tempfile.TemporaryDirectory() as folder:
         if done.xml is not None:
             path = Path(folder) / "extended.xml"
             path.write_bytes(done.xml.encode())
-            with quiet():
-                model = mujoco.MjModel.from_xml_path(str(path))
-            _compare(model, done.applied.model, path.name)
+            _check_mjcf(done, path)
+            release_free_memory()
         if done.urdf is not None:
             path = Path(folder) / "extended.urdf"
             path.write_bytes(done.urdf.encode())
             _check_urdf(robot, causes, path)
+
+
+def _check_mjcf(done: Written, path: Path) -> None:
+    """Compare what the MJCF says with the model that was meant."""
+    import mujoco
+
+    with quiet():
+        model = mujoco.MjModel.from_xml_path(str(path))
+    _compare(model, done.applied.model, path.name)
 
 
 def _check_urdf(robot: Robot, causes: Causes, path: Path) -> None:
@@ -63,9 +70,11 @@ def _check_urdf(robot: Robot, causes: Causes, path: Path) -> None:
     from sims.robot.reading import read
     from sims.robot.urdf_out import UrdfWriter
 
-    plain, writer = read(robot.path), UrdfWriter(robot, "")
+    writer = UrdfWriter(robot, "")
     held = {c.name: c.numbers for c in one_by_one(robot, causes) if writer.write(c) is None}
-    wanted, found = apply(plain, held).model, read(path).compiled
+    wanted = apply(read(robot.path), held).model
+    release_free_memory()
+    found = read(path).compiled
     for name in _OF_URDF:
         one, other = getattr(found, name), getattr(wanted, name)
         if one.shape != other.shape or not np.allclose(one, other, rtol=SAME, atol=SAME):

@@ -7,6 +7,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sims.robot.words import listed
 
@@ -51,18 +52,27 @@ def without(spec: Any, model: Any) -> list[str]:
 
 
 def possible(model: Any) -> bool:
-    """Whether any two shapes of a compiled model may ever touch, by MuJoCo's own rules of which are
-    looked at (its documentation, "Computation", collision detection).
+    """Whether any two shapes of a compiled model may ever touch."""
+    return bool(model.nflex or touching(model).any())
+
+
+def touching(model: Any) -> NDArray[np.bool_]:
+    """Find the geoms of a compiled model that may ever touch another one, by MuJoCo's own rules of
+    which pairs are looked at (its documentation, "Computation", collision detection).
+
+    Args:
+        model: the mujoco.MjModel, without flexes.
+
+    Returns:
+        (ngeom,) whether each may.
     """
     import mujoco
 
-    if model.npair or model.nflex:
-        return True
     weld = np.asarray(model.body_weldid)
     bodies = np.asarray(model.geom_bodyid)
     rows = (bodies, model.geom_contype, model.geom_conaffinity)
     # many shapes of a body have the same masks
-    body, kind, affinity = np.unique(np.stack(rows), axis=1)
+    (body, kind, affinity), of = np.unique(np.stack(rows), axis=1, return_inverse=True)
     masks = kind[:, None] & affinity
     meet = (masks | masks.T) != 0
     own = weld[body]
@@ -74,4 +84,6 @@ def possible(model: Any) -> bool:
         meet &= ~(carried | carried.T)
     first, second = np.minimum(body[:, None], body), np.maximum(body[:, None], body)
     meet &= ~np.isin((first << 16) + second, model.exclude_signature)
-    return bool(meet.any())
+    result: NDArray[np.bool_] = meet.any(axis=1)[of.reshape(-1)]
+    result[[*model.pair_geom1, *model.pair_geom2]] = True
+    return result

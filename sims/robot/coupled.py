@@ -56,9 +56,15 @@ def places(robot: Robot) -> tuple[str, ...]:
 
 
 def named(spec: Any, robot: Robot) -> dict[int, Any]:
-    """Write down the names of what has none in a spec: they count, and counts change; its joints
-    by their numbers.
+    """Name the joints and actuators of a spec that have no name, as the robot names them: by their
+    numbers, which change where elements are added.
+
+    Returns:
+        The joints by their numbers.
     """
+    if all(element.name for element in (*spec.joints, *spec.actuators)):
+        return {robot.joint(joint.name).id: joint for joint in spec.joints}
+    # Numbers are known once it has been compiled.
     with quiet():
         spec.compile()
     joints = {joint.id: joint for joint in spec.joints}

@@ -9,7 +9,7 @@ from sims.robot.document import FILES, Document
 from sims.robot.markup import UnfitError, number
 from sims.robot.mjcf_out import OWN, texts
 from sims.robot.model import Robot
-from sims.robot.precise import saved, unlike
+from sims.robot.precise import unlike
 from sims.robot.stated import ATTRIBUTES, Element, Values, whole
 from sims.robot.writing import SAME, compiled
 
@@ -96,8 +96,7 @@ def using(
     Raises:
         UnfitError: it would not be the model that was meant; says in what.
     """
-    folder = robot.path.resolve().parent
-    document = Document(saved(applied.spec, folder).encode(), robot.path)
+    document = Document(applied.text.encode(), robot.path)
     tags = document.numbered(applied.model)
     tag = tags[Element("joint", joint)]
     tag.new["class"] = name

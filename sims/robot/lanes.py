@@ -20,7 +20,6 @@ from sims.robot.floating import Afloat, Floating
 from sims.robot.midway import Look, Mask, Midway, Places
 from sims.robot.model import Robot
 from sims.robot.native import COUPLING, FIELDS, lanes_spec, write_friction_form
-from sims.robot.quiet import quiet
 from sims.robot.series import FIELDS as SERIES
 from sims.robot.series import WRITTEN, hung, is_series, press
 from sims.robot.series import write as in_series
@@ -93,8 +92,7 @@ def read_model(robot: Robot, derived: bool) -> Any:
                 objtype=mujoco.mjtObj.mjOBJ_JOINT,
                 objname=joint.name,
             )
-    with quiet():
-        return spec.compile()
+    return robot.compile(spec)
 
 
 def drives(model: Any, robot: Robot) -> dict[str, int]:
@@ -171,6 +169,12 @@ class Bench:
     def model(self) -> Any:
         """The mujoco.MjModel that lanes share but for their fields."""
         return self.batch.model
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the model that the batch copies, and of the lanes' own fields and states."""
+        own = [*self.fields.values(), *self._stated.values(), self.batch.state]
+        return int(self.model.nbuffer + sum(values.nbytes for values in own))
 
     def load(self, acting: Acting) -> None:
         """Write the native effects, with coefficients (K, LANES, 1), into the lanes' fields."""

@@ -39,15 +39,23 @@ class Mends:
     massless: dict[bool, list[str]] = field(default_factory=dict)
     slight: list[str] = field(default_factory=list)
 
-    def compiled(self, spec: Any) -> Any:
-        """The compiled model; what is mended on the way is changed in the spec.
+    def compiled(self, spec: Any) -> tuple[Any, Any]:
+        """Compile a spec, and mend what MuJoCo refuses and can be mended.
+
+        Args:
+            spec: a mujoco.MjSpec, not to be used afterwards.
+
+        Returns:
+            The spec with what was mended, before it is compiled: afterwards it would hold all
+            meshes once more. And the compiled model.
 
         Raises:
             InputError: MuJoCo refuses the model, in its own words.
         """
         for _ in range(2 * (len(spec.bodies) + len(spec.meshes) + len(spec.textures)) + 2):
             try:
-                return spec.compile()
+                before = spec.copy()
+                return before, spec.compile()
             except InputError:
                 raise
             except Exception as error:

@@ -13,6 +13,7 @@ from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
 import numpy as np
 
 from sims.base import InputError, unknown
+from sims.robot.collision_hulls import CollisionShapes
 from sims.robot.quiet import quiet
 
 Format = Literal["mjcf", "urdf"]
@@ -139,6 +140,7 @@ class Robot:
         coupled: joints whose drives turn the joint before as well (`sims.robot.coupled`).
         friction_form: of dry friction that effects add to the file's; the friction that the file
             states alone keeps the file's solver parameters.
+        shapes: what is written into its compiled models, where their meshes are convex hulls.
         kept: what functions `kept_with_robot` found of it.
     """
 
@@ -155,13 +157,22 @@ class Robot:
     series: Mapping[str, float] = field(default_factory=dict)
     coupled: tuple[str, ...] = ()
     friction_form: FrictionForm = "stiff"
+    shapes: CollisionShapes | None = None
     kept: dict[tuple[Any, ...], Any] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def compiled(self) -> Any:
         """The mujoco.MjModel; nobody writes into it."""
+        # A spec that has been compiled holds all meshes once more.
+        return self.compile(self.spec.copy())
+
+    def compile(self, spec: Any) -> Any:
+        """Compile a spec of this robot, a mujoco.MjSpec."""
         with quiet():
-            return self.spec.compile()
+            model = spec.compile()
+        if self.shapes is not None:
+            self.shapes.write(model)
+        return model
 
     def with_friction_form(self, form: FrictionForm) -> Robot:
         """The same robot, to which effects add dry friction in this form."""

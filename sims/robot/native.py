@@ -65,7 +65,7 @@ def lanes_model(robot: Robot) -> Any:
     MuJoCo stores less for a body that turns about its centre of mass, and refuses to move that
     centre afterwards; here it stores all. The motion is the same.
     """
-    return lanes_spec(robot).compile()
+    return robot.compile(lanes_spec(robot))
 
 
 def lanes_spec(robot: Robot) -> Any:

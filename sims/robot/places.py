@@ -286,7 +286,10 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
 
 
 def classes(
-    effect: type[Effect], found: Mapping[str, Sequence[Spot]], native: Collection[str]
+    effect: type[Effect],
+    found: Mapping[str, Sequence[Spot]],
+    native: Collection[str],
+    compiles: Callable[[type[Effect]], bool] = lambda _: True,
 ) -> Iterator[type[Effect]]:
     """An effect at all places of a robot where it can act, then its family.
 
@@ -294,6 +297,7 @@ def classes(
         effect: registered.
         found: the robot's places.
         native: effects that the engine writes into the model.
+        compiles: whether the model compiles that an effect at one place needs.
     """
     if effect.at == "world":
         if effect.name in native or (issubclass(effect, Sensor) and not effect.filters):
@@ -302,6 +306,7 @@ def classes(
     if effect.name not in native and not _for_one(effect):
         return
     members = [at_place(effect, s) for s in found[effect.at] if _acts_at(effect, s, found)]
+    members = [member for member in members if compiles(member)]
     yield from members
     # Encoders are of one make; what else is recorded has units of its own.
     alike = [m for m in members if effect.at != "channel" or m.place.startswith("q.")]

@@ -20,13 +20,12 @@ def saved(spec: Any, folder: Path) -> str:
     """The spec as MJCF, in the notation in which it was stated, its files found from anywhere.
 
     Args:
-        spec: a mujoco.MjSpec; it stays as it is.
+        spec: a mujoco.MjSpec that has been compiled, not to be used afterwards.
         folder: to which its files are relative.
 
     Raises:
         RuntimeError: this MuJoCo cannot be told how many digits to write.
     """
-    spec = spec.copy()
     spec.meshdir = str(folder / spec.meshdir)
     spec.texturedir = str(folder / spec.texturedir)
     spec.compiler.savecompiled = False

@@ -12,6 +12,7 @@ import numpy as np
 
 from sims.base import InputError
 from sims.limits import LARGEST, cut
+from sims.memory import release_free_memory
 from sims.robot import added, contacts, mjcf, names, urdf
 from sims.robot.mends import Mends
 from sims.robot.model import Format, Robot
@@ -85,11 +86,11 @@ def _robot(
     added.set_engine(spec, engine, source)
     notes += names.given(spec)
     above = {body.name: body.parent.name for body in spec.bodies if body.parent is not None}
-    model = mends.compiled(spec)
+    spec, model = mends.compiled(spec)
     _check(files, model)
     further = contacts.without(spec, model) if kind == "urdf" else []
     if further:
-        model = mends.compiled(spec)
+        spec, model = mends.compiled(spec)
     aliases = _fused(above, {model.body(i).name for i in range(model.nbody)})
     said = [f"MuJoCo says: {warning}" for warning in dict.fromkeys(warnings)]
     if model.nu == 0:
@@ -109,6 +110,8 @@ def _robot(
         speeds=urdf.speeds(root) if kind == "urdf" else {},
     )
     robot.__dict__["compiled"] = model  # which it would compile anew
+    if model.nmesh:
+        release_free_memory()
     return robot
 
 

@@ -40,6 +40,8 @@ from sims.robot.coupled import coupled as coupled_robot
 from sims.robot.coupled import places as coupled_places
 from sims.robot.model import Robot, kept_with_robot
 from sims.robot.native import RK4
+from sims.robot.quiet import one_line
+from sims.robot.simulation_model import strip_shapes
 from sims.system import Acting, Effect, Element, Hidden
 
 LIGHTEST = 0.01
@@ -100,7 +102,6 @@ def by_series(acting: Acting, count: int) -> dict[Added, list[int]]:
     return lanes
 
 
-@kept_with_robot
 def in_series(robot: Robot, added: Added) -> Robot:
     """The robot with more joints; elements keep the names that the robot has for them.
 
@@ -142,6 +143,22 @@ def in_series(robot: Robot, added: Added) -> Robot:
         spec.delete(key)
     series = {name_of(name, own): inertias[name] for name, own in by_joint(added).items()}
     return replace(robot, spec=spec, series=series)
+
+
+@kept_with_robot
+def compile_error(robot: Robot, added: Added) -> str:
+    """Say why the model with more joints does not compile; empty where it does.
+
+    Args:
+        robot: that was read.
+        added: as for `in_series`.
+    """
+    try:
+        in_series(strip_shapes(robot), added).compiled  # noqa: B018
+    # MuJoCo has errors of several kinds, and an effect of a user's plugin may raise any.
+    except Exception as error:
+        return one_line(error) or type(error).__name__
+    return ""
 
 
 @kept_with_robot

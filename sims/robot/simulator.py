@@ -18,6 +18,7 @@ from sims import effects as library
 from sims.base import Array, InputError, Scenario, unknown
 from sims.plan import Runs, make_runs
 from sims.robot.acting import derives, filled, is_asked, lanes_with, natives, part_of
+from sims.robot.bench_cache import RefusedModelError, bench_cache
 from sims.robot.compiled import compiled
 from sims.robot.drives import Shown
 from sims.robot.felt import INSTANT, SHARE
@@ -30,7 +31,7 @@ from sims.robot.model import FrictionForm, Robot
 from sims.robot.numerics import INTEGRATORS, Numerics, RobotEngine, own_numerics
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
-from sims.robot.series import Added, by_series, in_series
+from sims.robot.series import Added, by_series
 from sims.robot.system import RobotSystem, system_of
 from sims.robot.work import Given, Made, Start, Work, by_run, instants
 from sims.simulated import Simulated
@@ -68,7 +69,6 @@ class RobotSimulator(Simulated):
         self.robotic = self.system()
         self.addresses = Addresses(self.robot)
         self._floating = Floating.of(self.robot)
-        self._benches: dict[tuple[bool, int, Added], Bench] = {}
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
         if name not in (None, "mujoco"):
@@ -171,7 +171,11 @@ class RobotSimulator(Simulated):
                         for run, own in by_run(runs, part)
                     ]
                     bits = bool(kind & 1), bool(kind & 2)
-                    done = self._simulate(works, part_of(acting, part), *bits, series)
+                    try:
+                        done = self._simulate(works, part_of(acting, part), *bits, series)
+                    except RefusedModelError:
+                        # Its lanes stay NaN, as those of a motion that explodes; the rest goes on.
+                        continue
                     for (_, own), seen in zip(by_run(runs, part), done, strict=True):
                         result[own, : seen.shape[1]] = seen
         result += 0.0  # no zero is negative: whatever made it, it is the same zero
@@ -342,13 +346,10 @@ class RobotSimulator(Simulated):
         return Made(x, v, done, begun, bench.failed, (hidden[0], hidden[1]))
 
     def _bench(self, derived: bool, count: int, series: Added = ()) -> Bench:
-        key = derived, count, series
-        if key not in self._benches:
-            engine = self.engine
-            assert isinstance(engine, RobotEngine)
-            robot = in_series(self.robot, series) if series else self.robot
-            self._benches[key] = Bench(robot, derived, engine.numerics.settings(), count)
-        return self._benches[key]
+        engine = self.engine
+        assert isinstance(engine, RobotEngine)
+        settings = engine.numerics.settings()
+        return bench_cache(self.robot).bench(series, derived, count, settings)
 
     def _shown(self, made: Made, work: Work, times: Array, steps: int) -> Array:
         """What the sensors record: (n, T, C)."""
@@ -385,13 +386,6 @@ class RobotSimulator(Simulated):
         if kind == "tau":
             return self._bench(False, 1).drives[of]
         return next(s for s in self.robot.sensors if s.name == of).address
-
-    def close(self) -> None:
-        """Give back the batches."""
-        self._benches.clear()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_benches": {}}
 
 
 def _alike(acting: Acting, derived: Mask, asked: Mask) -> Iterator[tuple[Added, int, Places]]:

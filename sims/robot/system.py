@@ -11,11 +11,12 @@ import numpy as np
 from sims import effects as library
 from sims.base import Array, Channel, InputError, Parameter, unknown
 from sims.registry import SkippedError
-from sims.robot import places
+from sims.robot import coupled, places
 from sims.robot.floating import Floating
 from sims.robot.model import Robot
 from sims.robot.moment import OneJoint, Slide
 from sims.robot.native import FIELDS
+from sims.robot.series import Added, compile_error, is_series
 from sims.robot.spots import WORDS, Spot, spots
 from sims.robot.usual import Usual
 from sims.system import FAMILY, Effect, Kind, Moment, System
@@ -59,7 +60,7 @@ class RobotSystem(System):
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         # What is found of one robot is not of another, nor of the same with numbers freed.
-        cls.traced, cls._placed = {}, {}
+        cls.traced, cls._placed, cls.left_out = {}, {}, {}
 
     @classmethod
     def gear(cls, coordinate: int) -> float:
@@ -70,8 +71,25 @@ class RobotSystem(System):
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
         """The effect at every place, without those that the user has declared free."""
         if effect.name not in cls._placed:
-            cls._placed[effect.name] = tuple(places.classes(effect, cls.spots, FIELDS))
+            found = places.classes(effect, cls.spots, FIELDS, cls._compiles)
+            cls._placed[effect.name] = tuple(found)
         return [one for one in cls._placed[effect.name] if not cls.is_free(one)]
+
+    @classmethod
+    def _compiles(cls, effect: type[Effect]) -> bool:
+        """Whether the model compiles that an effect at one place needs; says in `left_out` where it
+        does not.
+        """
+        if effect.of == coupled.EFFECT:
+            added: Added = (coupled.ANY,)
+        elif is_series(effect):
+            added = ((effect.place, effect.of),)
+        else:
+            return True
+        error = compile_error(cls.robot, added)
+        if error:
+            cls.left_out[effect.name] = f"MuJoCo does not compile the model with it: {error}"
+        return not error
 
     @classmethod
     def is_free(cls, effect: type[Effect]) -> bool:
@@ -93,6 +111,8 @@ class RobotSystem(System):
         except SkippedError:
             raise
         cls.placed(registered)
+        if name in cls.left_out:
+            raise InputError(f"effect {name} of robot {cls.name}: {cls.left_out[name]}")
         known = {one.name: one for one in cls._placed[base]}
         if name in known:
             return known[name]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sims.extended import Number
+from sims.memory import release_free_memory
 from sims.robot.causes import one_by_one
 from sims.robot.changes import CLOSE, COULOMB, KEPT, ROUNDS, Applied, apply
 from sims.robot.coupled import before
@@ -20,7 +21,7 @@ from sims.robot.markup import UnfitError, heading, number, numbers
 from sims.robot.mjcf_out import Writer
 from sims.robot.model import TENDON, Robot
 from sims.robot.native import arm_of
-from sims.robot.precise import saved, unlike
+from sims.robot.precise import unlike
 from sims.robot.quiet import quiet
 from sims.robot.stated import Statement, lacking
 from sims.robot.urdf_out import UrdfWriter
@@ -76,8 +77,7 @@ def written(robot: Robot, causes: Causes, recording: str = "") -> Written:
     except UnfitError as unfit:
         if robot.format == "mjcf":
             said.append(f"the MJCF is as MuJoCo writes it, not as {robot.path.name}: {unfit}")
-        saving = saved(applied.spec, robot.path.resolve().parent)
-        text = Edit(applied.robot, applied, recording, saving.encode()).stated()
+        text = Edit(applied.robot, applied, recording, applied.text.encode()).stated()
     urdf = _urdf(robot, causes, recording, said) if robot.format == "urdf" else None
     return Written(text, urdf, tuple(said), applied)
 
@@ -232,6 +232,9 @@ def compiled(text: str) -> Any:
 
     try:
         with quiet():
-            return mujoco.MjSpec.from_string(text).compile()
+            model = mujoco.MjSpec.from_string(text).compile()
     except ValueError as error:
         raise UnfitError(f"MuJoCo refuses it: {' '.join(str(error).split())}") from None
+    # The spec held all meshes a second time.
+    release_free_memory()
+    return model

@@ -6,6 +6,7 @@ import pytest
 
 from bench.registry import robot
 from sims.base import Scenario
+from sims.robot.bench_cache import bench_cache
 from sims.robot.contacts import possible
 
 MODEL = """<mujoco>{option}<worldbody>{floor}
@@ -61,8 +62,32 @@ def test_only_contacts_that_cannot_be_are_not_looked_for(tmp_path):
         path.write_text(ARM.format(floor=shape))
         simulator = robot(path)(observe=["q.shoulder"])
         found[name] = simulator.simulate(np.zeros((1, len(simulator.parameters))), scenario)
-        (bench,) = simulator._benches.values()
+        (bench,) = bench_cache(simulator.robot).benches
         off = bool(bench.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT)
         assert off == (name == "none")
     np.testing.assert_array_equal(found["none"], found["far"])
     assert np.abs(found["near"] - found["far"]).max() > 0.1
+
+
+PILE = """<mujoco>{size}<worldbody><geom type="plane" size="3 3 0.1"/>
+  <body pos="0 0 0.021"><joint name="x" type="slide" axis="0 0 1"/>{boxes}</body>
+</worldbody><actuator><motor name="m" joint="x"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("memory", [6, 20, 30])
+def test_a_lane_whose_contacts_do_not_fit_in_its_arena_has_failed(tmp_path, memory):
+    boxes = "".join(
+        f'<geom type="box" size="0.05 0.05 0.02" pos="{0.12 * k} 0 0"/>' for k in range(12)
+    )
+    times = np.arange(30) / 100.0
+    found = {}
+    for size in ("", f'<size memory="{memory}K"/>'):
+        path = tmp_path / f"pile{len(size)}.xml"
+        path.write_text(PILE.format(size=size, boxes=boxes))
+        simulator = robot(path)(observe=["q.x"])
+        found[size] = simulator.simulate(
+            np.zeros((1, len(simulator.parameters))), Scenario(times, {}, {})
+        )
+    enough, little = found.values()
+    assert np.isfinite(enough).all()
+    assert np.isnan(little).all()

@@ -4,6 +4,7 @@ import numpy as np
 
 from bench.registry import robot
 from sims.base import Scenario
+from sims.robot.bench_cache import bench_cache
 from tests.sims.robot.arms import ARM
 
 TIMES = np.arange(40) / 100.0
@@ -19,5 +20,5 @@ def test_a_lane_alone_moves_as_among_many_and_pays_for_itself_alone(tmp_path):
     alone = np.concatenate([simulator.simulate(row[None], SCENARIO) for row in theta])
     np.testing.assert_array_equal(alone, together)
     assert np.ptp(together[:, -1], axis=0).min() > 1e-4
-    held = {count for _, count, _ in simulator._benches}
+    held = {bench.count for bench in bench_cache(kind.robot).benches}
     assert held == {1, 64}, "a batch of one, and the largest for twelve"
