@@ -12,6 +12,7 @@ from bench.gap.causes.alternatives import Evidence
 from bench.gap.causes.name import Finding
 from bench.gap.causes.score_test import tail
 from bench.gap.causes.search import Search
+from bench.gap.held_out import Validation
 from bench.gap.measure import Gain, gain, intervals
 from bench.gap.model.bounds import bound_of, coefficient_bounds
 from bench.gap.model.floor import Floor
@@ -35,7 +36,8 @@ class Assessor:
 
     Attributes:
         recording: what was explained.
-        fitting, measuring: its runs; None where none are held out.
+        fitting: the runs for fitting.
+        validation: predicts held-out runs, or each run by cross-validation; None without either.
         floor: the noise.
         engine: the engine's name; None for a simulator that steps itself.
         before: what the simulation gave of the held-out runs before its own step was mended; None
@@ -44,10 +46,15 @@ class Assessor:
 
     recording: Recording
     fitting: World
-    measuring: World | None
+    validation: Validation | None
     floor: Floor
     engine: str | None
     before: Array | None = None
+
+    @property
+    def measuring(self) -> World | None:
+        """Return the runs that the validation predicts; all runs if it is cross-validation."""
+        return None if self.validation is None else self.validation.world
 
     def verdict(
         self, search: Search, finding: Finding, rng: np.random.Generator, started: float
@@ -66,8 +73,8 @@ class Assessor:
         parameters = {world.parameters[i].name: numbers[i] for i in world.base.tolist()}
         # Counted before an experiment is proposed: what that simulates is not part of the answer.
         simulations = world.simulations
-        if self.measuring is not None:
-            simulations += self.measuring.simulations
+        if self.validation is not None:
+            simulations += self.validation.simulations
         heldout = self._heldout(finding, rng)
         candidates = self._candidates(search, finding)
         proposed = self._next(search, finding)

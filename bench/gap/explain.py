@@ -18,10 +18,11 @@ from bench.gap.causes.name import Finding, name
 from bench.gap.causes.rules import SWITCH
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import probes, remains
+from bench.gap.cross_validation import CrossValidation
 from bench.gap.design import Design, design
 from bench.gap.explanation import Explanation
 from bench.gap.freeze import frozen
-from bench.gap.held_out import HeldOutRuns
+from bench.gap.held_out import HeldOutRuns, Validation
 from bench.gap.model.base_fit import Base, fit_base, without_step
 from bench.gap.model.crew import Crew
 from bench.gap.model.floor import Floor, noise_floor
@@ -195,16 +196,25 @@ class _Explainer:
     def _enter(self, kind: type[Simulated]) -> None:
         """Take the recording for one of this simulator."""
         self.fitting = self._world(kind, self.recording.training())
-        held_out = self.recording.held_out()
-        # The same effects in the same places, so that a fitted vector means the same there.
-        self.measuring = self._world(kind, held_out) if held_out else None
         self.floor: Floor = noise_floor(self.fitting, self.recording)
         # White to begin with: each likelihood finds the memory of the noise for itself.
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
         self.kind = kind
-        self.assessor = Assessor(
-            self.recording, self.fitting, self.measuring, self.floor, self.engine
-        )
+        self.validation = self._validation(kind)
+        self.assessor = self._assessor()
+
+    def _validation(self, kind: type[Simulated]) -> Validation | None:
+        """Prepare the validation: on held-out runs, else by cross-validation of few runs."""
+        if held_out := self.recording.held_out():
+            # The same effects in the same places, so that a fitted vector means the same there.
+            return HeldOutRuns(self._world(kind, held_out), self.noise)
+        if len(self.recording.folds()) > 1:
+            return CrossValidation(self.fitting, self.noise)
+        return None
+
+    def _assessor(self) -> Assessor:
+        given = self.recording, self.fitting, self.validation, self.floor, self.engine
+        return Assessor(*given)
 
     def _world(self, kind: type[Simulated], runs: Sequence[Run]) -> World:
         world = World(kind, self.recording, runs, self.engine, probes(kind), self.free)
@@ -231,7 +241,8 @@ class _Explainer:
                 f"expected at least {least} for {unknowns} parameters and initial states"
             )
         # What is larger by so many orders is of a wrong unit, and nothing that a fit could follow.
-        parts = [part.observed for part in (world, self.measuring) if part is not None]
+        measuring = self.assessor.measuring
+        parts = [part.observed for part in (world, measuring) if part is not None]
         for c, channel in enumerate(world.simulator.channels):
             largest = max(float(np.nanmax(np.abs(part[..., c]), initial=0.0)) for part in parts)
             if largest >= HUGE * channel.scale:
@@ -266,8 +277,7 @@ class _Explainer:
         """
         base = search.base
         if not self.faults:
-            held_out = HeldOutRuns(self.measuring, self.noise) if self.measuring else None
-            finding = self.assessor.judged(search, name(search, held_out))
+            finding = self.assessor.judged(search, name(search, self.validation))
             self.faults = self._imitated(search, finding)
             if not self.faults:
                 return finding
@@ -288,9 +298,9 @@ class _Explainer:
 
     def close(self) -> None:
         """Let go of what simulates; not earlier, since experiments are proposed by simulating."""
-        for world in (self.fitting, self.measuring):
-            if world is not None:
-                world.close()
+        self.fitting.close()
+        if self.validation is not None:
+            self.validation.close()
 
     def design(self, seconds: float, longest: float) -> Design | None:
         """The next recording, after `run`: that which splits the first set of causes that is open,
@@ -345,7 +355,7 @@ class _Explainer:
         # Loaded where there is a robot alone.
         from bench.gap.model.numerics import finer
 
-        coarse = self.kind, self.fitting, self.measuring
+        coarse = self.kind, self.fitting, self.validation
         value, left = self._judged(base)
         for fine in finer(self.fitting, self.noise):
             # A finer step leaves less: one that is too coarse for what is left is not tried.
@@ -378,16 +388,16 @@ class _Explainer:
         nearby: Array = base.fit.theta[self.fitting.base]
         return nearby
 
-    def _before(self, base: Base, measuring: World | None) -> Array | None:
-        """What the file's own step makes of the held-out runs; None where there are none."""
-        if measuring is None:
+    def _before(self, base: Base, validation: Validation | None) -> Array | None:
+        """Predict the held-out runs with the file's own step; None without validation."""
+        if validation is None:
             return None
-        return HeldOutRuns(measuring, self.noise).measure([base.fit.theta])[0].simulated
+        return validation.validate([base.fit])[0].simulated
 
-    def _return(self, kind: type[Simulated], fitting: World, measuring: World | None) -> None:
+    def _return(self, kind: type[Simulated], fitting: World, validation: Validation | None) -> None:
         """Go back to worlds that were left."""
-        self.kind, self.fitting, self.measuring = kind, fitting, measuring
-        self.assessor = Assessor(self.recording, fitting, measuring, self.floor, self.engine)
+        self.kind, self.fitting, self.validation = kind, fitting, validation
+        self.assessor = self._assessor()
 
     def _judged(self, base: Base) -> tuple[float, float]:
         """Twice the log likelihood of a base model, and what it leaves, RMS in units of the

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -36,13 +37,47 @@ there once more.
 
 @dataclass(frozen=True)
 class Measured:
-    """Runs simulated with parameters that others gave: (R, T, C), their merit, which counts initial
-    states, and these (R, s).
+    """Runs simulated with parameters that were fitted to other runs.
+
+    Attributes:
+        simulated: (R, T, C); NaN if the simulation failed.
+        merit: (1), minus infinity if the simulation failed.
+        states: (R, s) initial states, fitted to these runs.
+        freedom: effective number of these states, the f of (1).
     """
 
     simulated: Array
     merit: float
     states: Array
+    freedom: float = 0.0
+
+
+class Validation(Protocol):
+    """Predict runs with models that were fitted to other runs: on held-out runs, or by
+    cross-validation (`bench.gap.cross_validation`).
+
+    Attributes:
+        world: the runs that are predicted.
+        noise: weighs the channels.
+        seen: (R, T, C) samples that exist.
+    """
+
+    world: World
+    noise: Noise
+    seen: Mask
+
+    @property
+    def simulations(self) -> int:
+        """Number of simulations made for the validation alone."""
+        ...
+
+    def validate(self, fits: Sequence[Fit]) -> list[Measured]:
+        """Predict the runs with each model, given by its fit to the runs for fitting."""
+        ...
+
+    def close(self) -> None:
+        """Release what the simulators hold."""
+        ...
 
 
 class HeldOutRuns:
@@ -57,6 +92,19 @@ class HeldOutRuns:
         self.world = world
         self.noise = noise
         self.seen: Mask = np.isfinite(world.observed)
+
+    @property
+    def simulations(self) -> int:
+        """Number of simulations of the held-out runs."""
+        return self.world.simulations
+
+    def close(self) -> None:
+        """Release what the simulator holds."""
+        self.world.close()
+
+    def validate(self, fits: Sequence[Fit]) -> list[Measured]:
+        """Predict the held-out runs with each model; as `measure`."""
+        return self.measure([fit.theta for fit in fits])
 
     def measure(self, thetas: Sequence[Array]) -> list[Measured]:
         """Simulate with each parameter vector (P,), initial states estimated run by run.
@@ -141,15 +189,18 @@ class HeldOutRuns:
         if not np.isfinite(fit.cost):
             nothing = np.full_like(self.world.observed, np.nan)
             return Measured(nothing, -np.inf, fit.states)
-        left = self.world.observed - fit.simulated
-        residual = np.where(self.seen, left, 0.0)
-        # Only initial states were fitted here, so they alone cost merit.
+        # Only initial states were fitted here, so they alone count as free.
         free = freedom(self.world, fit, self.noise)
-        count = int(self.seen.sum())
-        price = float(np.log(max(count, 2)))
-        likeliest = likelihood(residual, self.seen, free)
-        merit = likeliest.value - free * price  # (1)
-        return Measured(fit.simulated, merit, fit.states)
+        merit = merit_of(self.world.observed, fit.simulated, free)
+        return Measured(fit.simulated, merit, fit.states, free)
+
+
+def merit_of(observed: Array, simulated: Array, free: float) -> float:
+    """Merit (1) of predictions (R, T, C) with so many free initial states."""
+    seen = np.isfinite(observed)
+    residual = np.where(seen, observed - simulated, 0.0)
+    price = float(np.log(max(int(seen.sum()), 2)))
+    return likelihood(residual, seen, free).value - free * price  # (1)
 
 
 def _nearest(fits: Iterable[Fit]) -> Fit:

@@ -36,7 +36,7 @@ Z95 = 1.959964
 RESAMPLES = 2000
 """Bootstrap samples."""
 STRETCHES = 10
-"""Parts of a single run over which it is resampled."""
+"""Parts into which a run is divided for resampling, where runs are too few."""
 UNBOUNDED = 4.0
 """An interval wider than so many times the bounds, or the value, says that the data do not bound
 the parameter.
@@ -249,8 +249,8 @@ def gain(
 ) -> Gain:
     """Share of the gap closed (1), with a bootstrap interval over runs.
 
-    With a single run the resampling is over stretches of it (circular blocks; D. N. Politis, J. P.
-    Romano 1992).
+    With a single run, or two or three that are cross-validated, the resampling is over stretches of
+    them (circular blocks; D. N. Politis, J. P. Romano 1992).
 
     Args:
         world: the runs.
@@ -300,14 +300,16 @@ def _sums(world: World, before: Array, after: Array, channels: Sequence[int]) ->
 
 
 def _parts(world: World) -> list[tuple[int, slice]]:
-    """What is resampled: whole runs, or stretches of a single one."""
+    """What is resampled: whole runs, or stretches where runs are too few."""
     count = len(world.tracks)
-    if count > 1:
+    if count > 1 and world.runs[0].fold is None:
         return [(run, slice(None)) for run in range(count)]
-    edges = np.linspace(0, world.lengths[0], STRETCHES + 1)
-    samples = edges.astype(int).tolist()
-    # A run of few samples has stretches without any.
-    return [(0, slice(a, b)) for a, b in pairwise(samples) if b > a]
+    parts = []
+    for run, length in enumerate(world.lengths.tolist()):
+        samples = np.linspace(0, length, STRETCHES + 1).astype(int).tolist()
+        # A run of few samples has stretches without any.
+        parts += [(run, slice(a, b)) for a, b in pairwise(samples) if b > a]
+    return parts
 
 
 def _closed(sums: Array, floor: float) -> Array:
