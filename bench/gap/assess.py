@@ -56,6 +56,11 @@ class Assessor:
         """Return the runs that the validation predicts; all runs if it is cross-validation."""
         return None if self.validation is None else self.validation.world
 
+    @property
+    def _by_stretches(self) -> bool:
+        """Whether gains are resampled by stretches of runs: cross-validated runs are few."""
+        return self.validation is not None and self.validation.is_cross_validation
+
     def verdict(
         self, search: Search, finding: Finding, rng: np.random.Generator, started: float
     ) -> Verdict:
@@ -173,7 +178,8 @@ class Assessor:
         if not np.isfinite(before[np.isfinite(runs.observed)]).all():
             return None
         counted = self._counted()
-        result = gain(runs, before, after, counted, self._floor_of(finding), rng)
+        given = counted, self._floor_of(finding), rng, self._by_stretches
+        result = gain(runs, before, after, *given)
         return _heldout(result, self.fitting.simulator.channels[counted[0]].unit)
 
     def _candidates(self, search: Search, finding: Finding) -> tuple[Candidate, ...]:
@@ -230,7 +236,7 @@ class Assessor:
                 continue
             # A stream of its own: an interval must not depend on what else is resampled.
             rng = rng_for("held-out share", *names)
-            given = self._counted(), self._floor_of(finding), rng
+            given = self._counted(), self._floor_of(finding), rng, self._by_stretches
             result = gain(runs, before, simulated.simulated, *given)
             if np.isfinite(result.low) and np.isfinite(result.high):
                 found[names[0]] = result.low, result.high

@@ -41,6 +41,8 @@ class CrossValidation:
         seen: (R, T, C) samples that exist.
     """
 
+    is_cross_validation = True
+
     def __init__(self, world: World, noise: Noise) -> None:
         self.world = world
         self.noise = noise

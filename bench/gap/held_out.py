@@ -60,11 +60,13 @@ class Validation(Protocol):
         world: the runs that are predicted.
         noise: weighs the channels.
         seen: (R, T, C) samples that exist.
+        is_cross_validation: whether the runs are also those that the reported model is fitted to.
     """
 
     world: World
     noise: Noise
     seen: Mask
+    is_cross_validation: bool
 
     @property
     def simulations(self) -> int:
@@ -87,6 +89,8 @@ class HeldOutRuns:
         world: the runs, with the effects of the fitted model in the same places.
         noise: weighs the channels.
     """
+
+    is_cross_validation = False
 
     def __init__(self, world: World, noise: Noise) -> None:
         self.world = world

@@ -12,7 +12,6 @@ from bench.gap.assess import Assessor
 from bench.gap.causes.name import Finding
 from bench.gap.causes.rules import CHANCE
 from bench.gap.causes.search import Search
-from bench.gap.cross_validation import CrossValidation
 from bench.gap.identify import Number, identified
 from bench.gap.model.base_fit import Base
 from bench.gap.report import show
@@ -135,7 +134,8 @@ class Teller:
 
     @property
     def _is_cross_validated(self) -> bool:
-        return isinstance(self.assessor.validation, CrossValidation)
+        validation = self.assessor.validation
+        return validation is not None and validation.is_cross_validation
 
     @property
     def _how_validated(self) -> str:

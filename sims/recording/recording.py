@@ -242,7 +242,9 @@ def divided(recording: Recording, folds: bool = False) -> Recording:
     Raises:
         InputError: all runs are held out, or a single one is too short to be divided.
     """
-    return replace(recording, runs=_split(recording.path, recording.runs, folds))
+    path = recording.path
+    description = path.with_suffix(".toml") if path.suffix == ".csv" else path
+    return replace(recording, runs=_split(description, recording.runs, folds))
 
 
 MAX_FOLDS = 3

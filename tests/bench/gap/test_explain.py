@@ -321,7 +321,7 @@ def test_a_parameter_that_ends_at_its_border_is_told(tmp_path):
         lines += [f"{run},{t:.4f},{push:.9g},{where:.9g}" for t, push, where in rows]
     (tmp_path / "heavy.csv").write_text("\n".join(lines) + "\n")
     units = '[inputs.u]\nunit = "N"\n[channels.x]\nunit = "m"\nnoise = 1e-3\n'
-    (tmp_path / "heavy.toml").write_text(f'system = "slider"\n{units}')
+    (tmp_path / "heavy.toml").write_text(f'system = "slider"\n{units}[runs.1]\nheld_out = true\n')
     found = explained(tmp_path / "heavy.csv")
     # A gain of the sensor or of the input can stand in for the mass, and is not an answer.
     assert (found.verdict, found.causes) == ("unknown", ())
