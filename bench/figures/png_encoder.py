@@ -20,13 +20,13 @@ _METRE = 39.3701
 """Inches in a metre."""
 
 
-def encoded_png(rgba: bytes, width: int, height: int, dpi: float) -> bytes:
+def encoded_png(rgba: bytes | memoryview, height: int, width: int, dpi: float) -> bytes:
     """Encode an opaque picture as the bytes of a PNG file.
 
     Args:
         rgba: red, green, blue and opacity of each pixel, row by row; the opacity is left out.
-        width: pixels of a row.
         height: number of rows.
+        width: pixels of a row.
         dpi: dots an inch, for programs that print the file.
 
     Raises:

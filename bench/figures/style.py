@@ -396,11 +396,25 @@ def mark(figure: Figure, trusted: bool) -> Figure:
 
 def png(figure: Figure, dpi: int = DPI) -> bytes:
     """Render a figure as the bytes of a PNG file."""
-    file = BytesIO()
+    file = _Pixels()
     figure.savefig(file, format="rgba", dpi=dpi)
-    # The renderer rounds the size of the figure in pixels down.
-    width, height = (int(dpi * inches) for inches in figure.get_size_inches())
-    return encoded_png(file.getvalue(), width, height, dpi)
+    return encoded_png(file.getbuffer(), *file.shape, dpi=dpi)
+
+
+class _Pixels(BytesIO):
+    """The pixels of a figure as Matplotlib's renderer writes them.
+
+    Attributes:
+        shape: height and width; the renderer alone knows how it rounds them.
+    """
+
+    shape: tuple[int, int] = (0, 0)
+
+    def write(self, pixels: Any) -> int:
+        """Keep the pixels (H, W, 4) that are written at once."""
+        height, width, _ = memoryview(pixels).shape or (0, 0, 0)
+        self.shape = height, width
+        return super().write(pixels)
 
 
 def pdf(figure: Figure) -> bytes:
