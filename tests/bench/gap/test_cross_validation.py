@@ -78,6 +78,7 @@ def test_each_run_is_predicted_by_a_fit_to_the_other_alone():
         assert np.abs(predicted.simulated[run] - fit.simulated[run]).max() > 20 * SIGMA
 
 
+@pytest.mark.slow
 def test_a_cause_on_which_runs_disagree_is_not_named(tmp_path):
     """One run has strong dry friction and the other none: neither predicts the other with it."""
     times = TIMES[:75]
