@@ -8,8 +8,11 @@ With ``--json`` both are a document too (`bench.commands.answer`).
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, NoReturn
 
 from bench import __version__
@@ -113,6 +116,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from bench.figures.formats import pdf_figures
     from sims.base import InputError
 
+    if arguments is None:
+        # Only in a process of its own: a caller's environment is not changed.
+        _name_glfw_library()
     try:
         with printer.working(), pdf_figures(getattr(options, "pdf", False)):
             answer: Answer = options.command(options, printer.say)
@@ -133,6 +139,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         printer.fault("internal", f"{type(error).__name__}: {error}", WRONG)
         raise
     return answer.code
+
+
+def _name_glfw_library() -> None:
+    """Tell glfw, which MuJoCo imports, where its library is: the one that it would choose itself.
+
+    Else glfw starts an interpreter for each library that it finds, to ask for its version. That is
+    a third of the time of ``import mujoco``, in each process of a command.
+    """
+    if not sys.platform.startswith("linux") or "PYGLFW_LIBRARY" in os.environ:
+        return
+    package = find_spec("glfw")
+    if package is None or package.origin is None:
+        return
+    session = os.environ.get("PYGLFW_LIBRARY_VARIANT") or os.environ.get("XDG_SESSION_TYPE", "")
+    variant = "wayland" if session.lower() == "wayland" else "x11"
+    library = Path(package.origin).parent / variant / "libglfw.so"
+    if library.is_file():
+        os.environ["PYGLFW_LIBRARY"] = str(library)
 
 
 def parser() -> argparse.ArgumentParser:

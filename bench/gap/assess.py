@@ -15,6 +15,7 @@ from bench.gap.causes.name import Finding
 from bench.gap.causes.score_test import tail
 from bench.gap.causes.search import Search
 from bench.gap.friction_form import form_of, with_solver_parameters
+from bench.gap.held_out import Validation
 from bench.gap.measure import Gain, gain, intervals
 from bench.gap.model.bounds import bound_of, coefficient_bounds, is_unusual
 from bench.gap.model.floor import Floor
@@ -40,7 +41,8 @@ class Assessor:
 
     Attributes:
         recording: what was explained.
-        fitting, measuring: its runs; None where none are held out.
+        fitting: the runs for fitting.
+        validation: predicts held-out runs, or each run by cross-validation; None without either.
         floor: the noise.
         engine: the engine's name; None for a simulator that steps itself.
         before: what the simulation gave of the held-out runs before its own step was mended; None
@@ -49,10 +51,20 @@ class Assessor:
 
     recording: Recording
     fitting: World
-    measuring: World | None
+    validation: Validation | None
     floor: Floor
     engine: str | None
     before: Array | None = None
+
+    @property
+    def measuring(self) -> World | None:
+        """Return the runs that the validation predicts; all runs if it is cross-validation."""
+        return None if self.validation is None else self.validation.world
+
+    @property
+    def _by_stretches(self) -> bool:
+        """Whether gains are resampled by stretches of runs: cross-validated runs are few."""
+        return self.validation is not None and self.validation.is_cross_validation
 
     def verdict(
         self, search: Search, finding: Finding, rng: np.random.Generator, started: float
@@ -71,8 +83,8 @@ class Assessor:
         parameters = {world.parameters[i].name: numbers[i] for i in world.base.tolist()}
         # Counted before an experiment is proposed: what that simulates is not part of the answer.
         simulations = world.simulations
-        if self.measuring is not None:
-            simulations += self.measuring.simulations
+        if self.validation is not None:
+            simulations += self.validation.simulations
         heldout = self._heldout(finding, rng)
         candidates = self._candidates(search, finding)
         proposed = self._next(search, finding)
@@ -266,7 +278,8 @@ class Assessor:
         if not np.isfinite(before[np.isfinite(runs.observed)]).all():
             return None
         counted = self._counted()
-        result = gain(runs, before, after, counted, self._floor_of(finding), rng)
+        given = counted, self._floor_of(finding), rng, self._by_stretches
+        result = gain(runs, before, after, *given)
         return _heldout(result, self.fitting.simulator.channels[counted[0]].unit)
 
     def _candidates(self, search: Search, finding: Finding) -> tuple[Candidate, ...]:
@@ -323,7 +336,7 @@ class Assessor:
                 continue
             # A stream of its own: an interval must not depend on what else is resampled.
             rng = rng_for("held-out share", *names)
-            given = self._counted(), self._floor_of(finding), rng
+            given = self._counted(), self._floor_of(finding), rng, self._by_stretches
             result = gain(runs, before, simulated.simulated, *given)
             if np.isfinite(result.low) and np.isfinite(result.high):
                 found[names[0]] = result.low, result.high

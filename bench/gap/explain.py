@@ -18,11 +18,12 @@ from bench.gap.assess import Assessor
 from bench.gap.causes.name import Finding, name
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import probes, remains
+from bench.gap.cross_validation import CrossValidation
 from bench.gap.design import Design, design
 from bench.gap.explanation import Explanation
 from bench.gap.freeze import frozen
 from bench.gap.friction_form import soft_kind
-from bench.gap.held_out import HeldOutRuns
+from bench.gap.held_out import HeldOutRuns, Validation
 from bench.gap.model.base_fit import LAST_STEPS, Base, fit_base, without_step
 from bench.gap.model.crew import Crew
 from bench.gap.model.fit import Fitter
@@ -64,6 +65,7 @@ SOFT_FRICTION = (
 """What the user is told where the form of dry friction changes."""
 if TYPE_CHECKING:
     from bench.gap.model.numerics import Finer
+    from bench.gap.prediction_error.candidate_responses import FollowedRuns
 
 LEAST = 2.0
 """Samples for each unknown without which nothing can be said."""
@@ -181,7 +183,7 @@ class _Worlds(NamedTuple):
 
     kind: type[Simulated]
     fitting: World
-    measuring: World | None
+    validation: Validation | None
 
 
 class _Found(NamedTuple):
@@ -249,29 +251,49 @@ class _Explainer:
         self.coarse: Coarse | None = None
         # Finer steps that differ from the file's, and the worlds of the file's where one is used.
         self.finer: Reusable[Finer] | None = None
-        self.file = _Worlds(self.kind, self.fitting, self.measuring)
+        self.file = _Worlds(self.kind, self.fitting, self.validation)
         self.found: tuple[Search, Finding] | None = None
         self.faults: tuple[RecordingFault, ...] = ()
         self._check()
 
     def _enter(self, kind: type[Simulated]) -> None:
         """Take the recording for one of this simulator."""
-        before = getattr(self, "fitting", None), getattr(self, "measuring", None)
+        before = self._followed()
         self.fitting = self._world(kind, self.recording.training())
-        held_out = self.recording.held_out()
-        # The same effects in the same places, so that a fitted vector means the same there.
-        self.measuring = self._world(kind, held_out) if held_out else None
-        for known, world in zip(before, (self.fitting, self.measuring), strict=True):
-            if known is not None and world is not None and known.followed is not None:
-                # Where the runs begin depends little on how they are stepped.
-                world.follow(known.followed)
         self.floor: Floor = noise_floor(self.fitting, self.recording)
         # White to begin with: each likelihood finds the memory of the noise for itself.
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
         self.kind = kind
-        self.assessor = Assessor(
-            self.recording, self.fitting, self.measuring, self.floor, self.engine
-        )
+        self.validation = self._validation(kind)
+        self.assessor = self._assessor()
+        for known, world in zip(before, self._worlds(), strict=False):
+            # Where the runs begin depends little on how they are stepped.
+            world.follow(known)
+
+    def _worlds(self) -> list[World]:
+        """The runs for fitting, and those held out."""
+        validation = self.validation
+        held_out = validation.world if isinstance(validation, HeldOutRuns) else None
+        return [self.fitting] if held_out is None else [self.fitting, held_out]
+
+    def _followed(self) -> list[FollowedRuns]:
+        """Runs of a robot as a filter follows them, if it does."""
+        if not hasattr(self, "fitting"):
+            return []
+        return [w.followed for w in self._worlds() if w.followed is not None]
+
+    def _validation(self, kind: type[Simulated]) -> Validation | None:
+        """Prepare the validation: on held-out runs, else by cross-validation of few runs."""
+        if held_out := self.recording.held_out():
+            # The same effects in the same places, so that a fitted vector means the same there.
+            return HeldOutRuns(self._world(kind, held_out), self.noise)
+        if len(self.recording.folds()) > 1:
+            return CrossValidation(self.fitting, self.noise)
+        return None
+
+    def _assessor(self) -> Assessor:
+        given = self.recording, self.fitting, self.validation, self.floor, self.engine
+        return Assessor(*given)
 
     def _world(self, kind: type[Simulated], runs: Sequence[Run]) -> World:
         world = World(kind, self.recording, runs, self.engine, probes(kind), self.free)
@@ -299,7 +321,8 @@ class _Explainer:
                 f"expected at least {least} for {unknowns} parameters and initial states"
             )
         # What is larger by so many orders is of a wrong unit, and nothing that a fit could follow.
-        parts = [part.observed for part in (world, self.measuring) if part is not None]
+        measuring = self.assessor.measuring
+        parts = [part.observed for part in (world, measuring) if part is not None]
         for c, channel in enumerate(world.simulator.channels):
             largest = max(float(np.nanmax(np.abs(part[..., c]), initial=0.0)) for part in parts)
             if largest >= HUGE * channel.scale:
@@ -363,8 +386,7 @@ class _Explainer:
         """
         base = search.base
         if not self.faults:
-            held_out = HeldOutRuns(self.measuring, self.noise) if self.measuring else None
-            finding = self.assessor.judged(search, name(search, held_out))
+            finding = self.assessor.judged(search, name(search, self.validation))
             self.faults = self._imitated(search, finding) or self._unexplained(search, finding)
             if not self.faults:
                 return finding
@@ -394,9 +416,9 @@ class _Explainer:
 
     def close(self) -> None:
         """Let go of what simulates; not earlier, since experiments are proposed by simulating."""
-        for world in (self.fitting, self.measuring):
-            if world is not None:
-                world.close()
+        self.fitting.close()
+        if self.validation is not None:
+            self.validation.close()
 
     def design(self, seconds: float, longest: float) -> Design | None:
         """The next recording, after `run`: that which splits the first set of causes that is open,
@@ -455,10 +477,9 @@ class _Explainer:
         # Loaded where there is a robot alone.
         from bench.gap.prediction_error.candidate_responses import FollowedRuns
 
-        for world in (self.fitting, self.measuring):
-            if world is not None:
-                self.watch.stage("following the runs with the model")
-                world.follow(FollowedRuns.follow(world, world.nominal(), self.noise, None))
+        for world in self._worlds():
+            self.watch.stage("following the runs with the model")
+            world.follow(FollowedRuns.follow(world, world.nominal(), self.noise, None))
 
     def _prepared(self, base: Base) -> Base:
         """The base model of a robot with the step that the data ask for, and without free numbers
@@ -491,8 +512,8 @@ class _Explainer:
         declared = {p.name: p.bounds for p in self.fitting.parameters}
         declared |= {name: bounds for name, (bounds, _) in self.wider.items()}
         base, found = fit_wider(self.fitting, self.noise, base)
-        if self.measuring is not None:
-            use_bounds(self.measuring, found)
+        for world in self._worlds()[1:]:
+            use_bounds(world, found)
         for parameter, (low, high) in found.items():
             self.say(f"{parameter} ends at a bound of its range: widened to {low:g} to {high:g}")
         self.wider |= {one: (declared[one], bounds) for one, bounds in found.items()}
@@ -519,7 +540,7 @@ class _Explainer:
         from bench.gap.model.numerics import finer
 
         self.finer = Reusable(finer(self.fitting, self.noise))
-        file = _Worlds(self.kind, self.fitting, self.measuring)
+        file = _Worlds(self.kind, self.fitting, self.validation)
         value, left = self._judged(base)
         gap = left - 1.0
         for fine in self.finer:
@@ -545,7 +566,7 @@ class _Explainer:
         numerics = fine.numerics
         self.say(f"stepped more finely: {numerics.integrator}, {numerics.timestep:g} s")
         self.coarse, self.file = Coarse(fine, gain), file
-        self.assessor = replace(self.assessor, before=self._before(base, file.measuring))
+        self.assessor = replace(self.assessor, before=self._before(base, file.validation))
 
     def _with_better_step(self, search: Search, finding: Finding) -> _Found | None:
         """The answer with another step, where that explains the data better with the effects of
@@ -561,7 +582,7 @@ class _Explainer:
         if not finding.causes and (self.coarse is not None or finding.verdict == "adequate"):
             return None
         found = finding.model.merit, search.excess(finding.model)
-        here = _Worlds(self.kind, self.fitting, self.measuring)
+        here = _Worlds(self.kind, self.fitting, self.validation)
         if self.coarse is not None:
             before = self.assessor.before
             self._return(self.file)
@@ -612,17 +633,16 @@ class _Explainer:
         nearby: Array = base.fit.theta[self.fitting.base]
         return nearby
 
-    def _before(self, base: Base, measuring: World | None) -> Array | None:
-        """What the file's own step makes of the held-out runs; None where there are none."""
-        if measuring is None:
+    def _before(self, base: Base, validation: Validation | None) -> Array | None:
+        """Predict the held-out runs with the file's own step; None without validation."""
+        if validation is None:
             return None
-        return HeldOutRuns(measuring, self.noise).measure([base.fit.theta])[0].simulated
+        return validation.validate([base.fit])[0].simulated
 
     def _return(self, worlds: _Worlds, before: Array | None = None) -> None:
         """Go back to worlds that were left."""
-        self.kind, self.fitting, self.measuring = worlds
-        given = self.recording, self.fitting, self.measuring, self.floor, self.engine
-        self.assessor = Assessor(*given, before)
+        self.kind, self.fitting, self.validation = worlds
+        self.assessor = replace(self._assessor(), before=before)
 
     def _judged(self, base: Base) -> tuple[float, float]:
         """Twice the log likelihood of a base model, and what it leaves, RMS in units of the

@@ -151,7 +151,7 @@ class Explanation:
         if not self.causes or held_out is None or not closes(held_out):
             return ""
         share = percent(held_out.gap_closed)
-        return f"{share} of the gap closed{interval(held_out)} on held-out runs"
+        return f"{share} of the gap closed{interval(held_out)} on {self.story.validation_runs}"
 
     def _repr_html_(self) -> str:
         """The report for a notebook's cell, in a frame of its own so that its styles stay there."""

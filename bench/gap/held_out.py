@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -38,13 +39,49 @@ there once more.
 
 @dataclass(frozen=True)
 class Measured:
-    """Runs simulated with parameters that others gave: (R, T, C), their merit, which counts initial
-    states, and these (R, s).
+    """Runs simulated with parameters that were fitted to other runs.
+
+    Attributes:
+        simulated: (R, T, C); NaN if the simulation failed.
+        merit: (1), minus infinity if the simulation failed.
+        states: (R, s) initial states, fitted to these runs.
+        freedom: effective number of these states, the f of (1).
     """
 
     simulated: Array
     merit: float
     states: Array
+    freedom: float = 0.0
+
+
+class Validation(Protocol):
+    """Predict runs with models that were fitted to other runs: on held-out runs, or by
+    cross-validation (`bench.gap.cross_validation`).
+
+    Attributes:
+        world: the runs that are predicted.
+        noise: weighs the channels.
+        seen: (R, T, C) samples that exist.
+        is_cross_validation: whether the runs are also those that the reported model is fitted to.
+    """
+
+    world: World
+    noise: Noise
+    seen: Mask
+    is_cross_validation: bool
+
+    @property
+    def simulations(self) -> int:
+        """Number of simulations made for the validation alone."""
+        ...
+
+    def validate(self, fits: Sequence[Fit]) -> list[Measured]:
+        """Predict the runs with each model, given by its fit to the runs for fitting."""
+        ...
+
+    def close(self) -> None:
+        """Release what the simulators hold."""
+        ...
 
 
 class HeldOutRuns:
@@ -55,10 +92,25 @@ class HeldOutRuns:
         noise: weighs the channels.
     """
 
+    is_cross_validation = False
+
     def __init__(self, world: World, noise: Noise) -> None:
         self.world = world
         self.noise = noise
         self.seen: Mask = np.isfinite(world.observed)
+
+    @property
+    def simulations(self) -> int:
+        """Number of simulations of the held-out runs."""
+        return self.world.simulations
+
+    def close(self) -> None:
+        """Release what the simulator holds."""
+        self.world.close()
+
+    def validate(self, fits: Sequence[Fit]) -> list[Measured]:
+        """Predict the held-out runs with each model; as `measure`."""
+        return self.measure([fit.theta for fit in fits])
 
     def measure(self, thetas: Sequence[Array]) -> list[Measured]:
         """Simulate with each parameter vector (P,), initial states estimated run by run.
@@ -79,7 +131,7 @@ class HeldOutRuns:
         apart = [i for i, fit in enumerate(fits) if not fit.cost < limit]
         starts = [replace(fits[i].start(), states=nearest.states) for i in apart]
         # These states are good over the first share of the runs already.
-        again = self._fitted(starts, STAGES[1:])
+        again = self._fitted(starts, FOLLOWED if followed else STAGES[1:])
         for i, fit in zip(apart, again, strict=True):
             fits[i] = _nearest([fits[i], fit])
         return [self._measured(fit) for fit in fits]
@@ -144,15 +196,18 @@ class HeldOutRuns:
         if not np.isfinite(fit.cost):
             nothing = np.full_like(self.world.observed, np.nan)
             return Measured(nothing, -np.inf, fit.states)
-        left = self.world.observed - fit.simulated
-        residual = np.where(self.seen, left, 0.0)
-        # Only initial states were fitted here, so they alone cost merit.
+        # Only initial states were fitted here, so they alone count as free.
         free = freedom(self.world, fit, self.noise)
-        count = int(self.seen.sum())
-        price = float(np.log(max(count, 2)))
-        likeliest = likelihood(residual, self.seen, free)
-        merit = likeliest.value - free * price  # (1)
-        return Measured(fit.simulated, merit, fit.states)
+        merit = merit_of(self.world.observed, fit.simulated, free)
+        return Measured(fit.simulated, merit, fit.states, free)
+
+
+def merit_of(observed: Array, simulated: Array, free: float) -> float:
+    """Merit (1) of predictions (R, T, C) with so many free initial states."""
+    seen = np.isfinite(observed)
+    residual = np.where(seen, observed - simulated, 0.0)
+    price = float(np.log(max(int(seen.sum()), 2)))
+    return likelihood(residual, seen, free).value - free * price  # (1)
 
 
 def _nearest(fits: Iterable[Fit]) -> Fit:

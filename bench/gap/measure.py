@@ -36,7 +36,7 @@ Z95 = 1.959964
 RESAMPLES = 2000
 """Bootstrap samples."""
 STRETCHES = 10
-"""Parts of a single run over which it is resampled."""
+"""Parts into which a run is divided for resampling, where runs are too few."""
 UNBOUNDED = 4.0
 """An interval wider than so many times the bounds, or the value, says that the data do not bound
 the parameter.
@@ -246,11 +246,12 @@ def gain(
     channels: Sequence[int],
     floor: float,
     rng: np.random.Generator,
+    by_stretches: bool = False,
 ) -> Gain:
     """Share of the gap closed (1), with a bootstrap interval over runs.
 
-    With a single run the resampling is over stretches of it (circular blocks; D. N. Politis, J. P.
-    Romano 1992).
+    With a single run, or if asked for, the resampling is over stretches of the runs (circular
+    blocks; D. N. Politis, J. P. Romano 1992).
 
     Args:
         world: the runs.
@@ -259,8 +260,9 @@ def gain(
         channels: those that count; they share a unit.
         floor: RMS of the noise over them.
         rng: of the resampling.
+        by_stretches: resample stretches of the runs, as two or three runs are too few to resample.
     """
-    sums = _sums(world, before, after, channels)
+    sums = _sums(world, before, after, channels, by_stretches)
     whole = sums.sum(axis=0)
     before_sum, after_sum, count = whole
     base = float(np.sqrt(before_sum / count))
@@ -278,12 +280,12 @@ def gain(
     return Gain(base, extended, floor, closed, low, high)
 
 
-def _sums(world: World, before: Array, after: Array, channels: Sequence[int]) -> Array:
-    """(n, 3): sums of squares before and after, and samples, of each run, or of the stretches of a
-    single one.
-    """
+def _sums(
+    world: World, before: Array, after: Array, channels: Sequence[int], by_stretches: bool
+) -> Array:
+    """(n, 3): sums of squares before and after, and samples, of each run or stretch."""
     rows = []
-    for run, part in _parts(world):
+    for run, part in _parts(world, by_stretches):
         observed = world.observed[run, part][:, channels]
         seen = np.isfinite(observed)
         # A part without samples would be a row of zeros, and its error a quotient of them.
@@ -299,15 +301,17 @@ def _sums(world: World, before: Array, after: Array, channels: Sequence[int]) ->
     return np.array(rows)
 
 
-def _parts(world: World) -> list[tuple[int, slice]]:
-    """What is resampled: whole runs, or stretches of a single one."""
+def _parts(world: World, by_stretches: bool) -> list[tuple[int, slice]]:
+    """What is resampled: whole runs, or stretches where runs are too few."""
     count = len(world.tracks)
-    if count > 1:
+    if count > 1 and not by_stretches:
         return [(run, slice(None)) for run in range(count)]
-    edges = np.linspace(0, world.lengths[0], STRETCHES + 1)
-    samples = edges.astype(int).tolist()
-    # A run of few samples has stretches without any.
-    return [(0, slice(a, b)) for a, b in pairwise(samples) if b > a]
+    parts = []
+    for run, length in enumerate(world.lengths.tolist()):
+        samples = np.linspace(0, length, STRETCHES + 1).astype(int).tolist()
+        # A run of few samples has stretches without any.
+        parts += [(run, slice(a, b)) for a, b in pairwise(samples) if b > a]
+    return parts
 
 
 def _closed(sums: Array, floor: float) -> Array:

@@ -77,6 +77,7 @@ class Teller:
             track=self._track(),
             logs=max(1, len({run.log for run in recording.runs})),
             thorough=self.search.thorough,
+            cross_validated=self._is_cross_validated,
             share_intervals=self.assessor.share_intervals(self.finding),
         )
 
@@ -131,6 +132,15 @@ class Teller:
             return ()
         return identified(self.search.world, self.search.noise, scanned.at, scanned.directions)
 
+    @property
+    def _is_cross_validated(self) -> bool:
+        validation = self.assessor.validation
+        return validation is not None and validation.is_cross_validation
+
+    @property
+    def _how_validated(self) -> str:
+        return "left out" if self._is_cross_validated else "held out"
+
     def _held_out(self, sigma: Array) -> tuple[Side | None, list[Place]]:
         """The held-out runs and where their gap is; None and nothing where none was measured."""
         world = self.assessor.measuring
@@ -141,7 +151,7 @@ class Teller:
             return None, []
         before = measured[()].simulated
         after = measured[names].simulated
-        places = show.places(world, before, after, sigma, " (held out)")
+        places = show.places(world, before, after, sigma, f" ({self._how_validated})")
         # Channels and phases are told of the fitted runs alone; of held-out ones, each run.
         runs = [place for place in places if place.kind == "run"]
         return show.side(world, before, after), runs

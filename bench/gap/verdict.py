@@ -77,7 +77,8 @@ class Cause:
 
 @dataclass(frozen=True, repr=False)
 class Heldout:
-    """Errors on held-out runs; None where the data give no number.
+    """Errors on held-out runs, or on each run left out of the fit in turn where two or three runs
+    are not marked; None where the data give no number.
 
     Attributes:
         rmse_base: of the tuned base model, in the unit.
@@ -200,7 +201,8 @@ class Verdict:
         engine: that stepped the simulator; ``its own`` where it steps itself.
         causes: what the simulator lacks, strongest first.
         parameters: the base parameters with their 95 % intervals, by name.
-        heldout: the gain on held-out runs; None where there are none, or the simulation failed.
+        heldout: the gain on held-out runs, or on runs left out in turn; None where there are
+            neither, or the simulation failed.
         candidates: the library, the strongest first; empty where nothing was scored.
         next_experiment: what to record next; None where nothing is open.
         simulations: how many were spent.

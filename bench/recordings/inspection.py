@@ -43,6 +43,7 @@ def load(
     system: str | None = None,
     model: str | Path | None = None,
     free: Sequence[str] = (),
+    divide: bool = True,
 ) -> tuple[Recording, type[Simulator]]:
     """A recording, and the simulator of the system it is of (or of `system`, or of `model`).
 
@@ -51,13 +52,18 @@ def load(
         system: take it for this system, whatever it says of itself.
         model: take it for this robot: a model file.
         free: numbers of a robot's model file that are tuned; those of its description without.
+        divide: divide the runs for fitting and validation as `simgap explain` does; False to hold
+            out marked runs only.
 
     Raises:
         InputError: it cannot be read, or there is no such system.
     """
     path = source.path if isinstance(source, Recording) else Path(source)
     kind = kind_of(source, path, system, model, free)
-    recording = divided(source) if isinstance(source, Recording) else read_recording(path, kind)
+    memory = source if isinstance(source, Recording) else None
+    recording = memory or read_recording(path, kind, whole=True)
+    if divide:
+        recording = divided(recording, folds=True)
     refuse_huge(recording)
     return recording, kind
 
@@ -111,6 +117,8 @@ def summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
     # One run alone is divided: then two parts have one name.
     whole = len({run.name for run in runs})
     held = "its last third held out" if whole < len(runs) else f"{held_out} held out"
+    if recording.folds():
+        held = "each left out in turn"
     size = f"{_count(whole, 'run')} ({held}), {samples} samples, {seconds:.4g} s"
     yield f"{recording.path}: system {recording.system}, {size}"
     yield ""
@@ -124,11 +132,17 @@ def summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
     yield from _constants(recording, kind)
 
 
+def _use(run: Run) -> str:
+    if run.fold is not None:
+        return "left out in turn"
+    return "held out" if run.held_out else "fitting"
+
+
 def _run_row(run: Run) -> tuple[str, ...]:
     facts = run_facts(run)
     return (
         facts.name,
-        "held out" if facts.held_out else "fitting",
+        _use(run),
         str(facts.samples),
         f"{facts.seconds:.4g}",
         f"{facts.rate:.4g}",

@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.recordings.inspection import load
 from sims.base import InputError, Simulator
-from sims.recording.recording import Recording, Run
+from sims.recording.recording import MAX_FOLDS, Recording, Run, divided
 
 
 def load_all(
@@ -21,19 +21,24 @@ def load_all(
 ) -> tuple[Recording, type[Simulator]]:
     """Recordings as one, and the simulator that they are of; arguments as those of `load`.
 
-    Each holds out what it would hold out alone. A constant that they state differently is one of
-    their runs; a noise that they state differently is the root of the mean of its squares.
+    Two or three unmarked runs in all are cross-validated; else each recording holds out what it
+    would hold out alone, a run at least. A constant that they state differently is one of their
+    runs; a noise that they state differently is the root of the mean of its squares.
 
     Raises:
         InputError: one cannot be read, or they are not of one system with the same channels.
     """
-    loaded = [load(source, system, model, free) for source in sources]
+    loaded = [load(source, system, model, free, divide=False) for source in sources]
     first, kind = loaded[0]
     if len(loaded) == 1:
-        return first, kind
+        return divided(first, folds=True), kind
     for recording, other in loaded[1:]:
         _refuse_other(first, kind, recording, other)
     recordings = [recording for recording, _ in loaded]
+    runs_of_all = [run for recording in recordings for run in recording.runs]
+    folds = len(runs_of_all) <= MAX_FOLDS and not any(run.held_out for run in runs_of_all)
+    if not folds:
+        recordings = [divided(recording) for recording in recordings]
     names = names_of([recording.path for recording in recordings])
     constants = {
         key: value
@@ -61,7 +66,7 @@ def load_all(
         noise=_noise(recordings),
         runs=tuple(runs),
     )
-    return joined, kind
+    return (divided(joined, folds=True) if folds else joined), kind
 
 
 def _constant(key: str, recording: Recording, run: Run, usual: dict[str, float]) -> float:

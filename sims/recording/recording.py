@@ -58,6 +58,8 @@ class Run:
         linear: inputs that go straight from one sample to the next; the others hold.
         offset: seconds by which inputs act later than their stamps say.
         log: that it is of, where several recordings were joined.
+        fold: number of the cross-validation fold that leaves this run out and predicts it; None
+            where no cross-validation is made.
         before: of a part of a run, inputs before it, as in `Scenario`.
     """
 
@@ -72,12 +74,15 @@ class Run:
     linear: frozenset[str] = frozenset()
     offset: float = 0.0
     log: str = ""
+    fold: int | None = None
     before: Mapping[str, Array] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         # A cell of a notebook that ends in a run would print all of its samples.
         seconds = self.times[-1] - self.times[0] if self.times.size else 0.0
         use = "held out" if self.held_out else "for fitting"
+        if self.fold is not None:
+            use += f", left out of fold {self.fold + 1}"
         return f"<run {self.name}: {self.times.size} samples, {seconds:.4g} s, {use}>"
 
     def part(self, rows: slice, name: str = "") -> Run:
@@ -128,6 +133,8 @@ class Recording:
         first = self.runs[0] if self.runs else None
         channels = ", ".join(first.channels) if first else "none"
         runs = f"{len(self.runs)} runs, {len(self.held_out())} of them held out"
+        if self.folds():
+            runs = f"{len(self.runs)} runs, cross-validated in {len(self.folds())} folds"
         return f"<recording {self.path.name}: {self.system}, {runs}, channels {channels}>"
 
     def training(self) -> tuple[Run, ...]:
@@ -138,8 +145,14 @@ class Recording:
         """Runs for measuring."""
         return tuple(run for run in self.runs if run.held_out)
 
+    def folds(self) -> tuple[int, ...]:
+        """Return the numbers of the cross-validation folds; empty if runs are held out instead."""
+        return tuple(sorted({run.fold for run in self.runs if run.fold is not None}))
 
-def read_recording(path: str | Path, declared: Declared, whole: bool = False) -> Recording:
+
+def read_recording(
+    path: str | Path, declared: Declared, whole: bool = False, folds: bool = False
+) -> Recording:
     """Read `NAME.csv` and `NAME.toml` and check them against a system's channels, inputs, constants
     and states.
 
@@ -148,6 +161,8 @@ def read_recording(path: str | Path, declared: Declared, whole: bool = False) ->
         declared: the system, or a simulator of it; `system_of` says which system the recording
             states.
         whole: hold nothing out but the runs that are marked, and do not divide a single run.
+        folds: number two or three unmarked runs as cross-validation folds instead of holding one
+            of them out.
 
     Raises:
         InputError: anything malformed, in one line.
@@ -163,7 +178,7 @@ def read_recording(path: str | Path, declared: Declared, whole: bool = False) ->
         parts = read_table(table, *columns, list(about.extra))
     check_names(description, about.runs, [part.name for part in parts])
     runs = [_run(table, part, about) for part in parts]
-    kept = tuple(runs) if whole else _split(description, runs)
+    kept = tuple(runs) if whole else _split(description, runs, folds)
     return Recording(
         table,
         about.system,
@@ -214,16 +229,26 @@ def recording_of_frame(
     )
 
 
-def divided(recording: Recording) -> Recording:
-    """The recording with something held out, as `read_recording` gives it: marked runs, else every
-    third one, else the last third of a single one.
+def divided(recording: Recording, folds: bool = False) -> Recording:
+    """Return the recording with its runs divided for fitting and validation, as by
+    `read_recording`: marked runs are held out, else every third run, else the last third of a
+    single run.
+
+    Args:
+        recording: as it was read.
+        folds: number two or three unmarked runs as cross-validation folds instead of holding one
+            of them out.
 
     Raises:
         InputError: all runs are held out, or a single one is too short to be divided.
     """
-    return replace(recording, runs=_split(recording.path, recording.runs))
+    path = recording.path
+    description = path.with_suffix(".toml") if path.suffix == ".csv" else path
+    return replace(recording, runs=_split(description, recording.runs, folds))
 
 
+MAX_FOLDS = 3
+"""Largest number of unmarked runs that are cross-validated: with more, every third is held out."""
 _UNMARKED = RunMarks({}, {}, None)
 """What is said of a run that the description does not mention."""
 _THIRD = 3
@@ -273,10 +298,9 @@ def _converted(table: Path, part: TableRun, name: str, scale: Scale) -> Array:
     return frozen(result)
 
 
-def _split(path: Path, runs: Sequence[Run]) -> tuple[Run, ...]:
-    """The runs with some held out: those marked, else every third run, else the last third of a
-    single run.
-    """
+def _split(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
+    """Divide the runs for fitting and validation; see `divided`."""
+    runs = [replace(run, fold=None) for run in runs]
     if any(run.held_out for run in runs):
         if all(run.held_out for run in runs):
             raise InputError(
@@ -286,6 +310,8 @@ def _split(path: Path, runs: Sequence[Run]) -> tuple[Run, ...]:
         return tuple(runs)
     if len(runs) == 1:
         return _halves(path, runs[0])
+    if folds and len(runs) <= MAX_FOLDS:
+        return tuple(replace(run, fold=number) for number, run in enumerate(runs))
     # the last of each three, so that early and late runs are fitted; of two the second
     marked = [i % _THIRD == _THIRD - 1 or (len(runs) == 2 and i == 1) for i in range(len(runs))]
     return tuple(replace(run, held_out=mark) for run, mark in zip(runs, marked, strict=True))

@@ -286,8 +286,7 @@ class RobotSimulator(Simulated):
         assert isinstance(engine, RobotEngine)
         settings = dict(engine.numerics.settings())
         settings["timestep"] *= 0.5
-        robot = in_series(self.robot, series) if series else self.robot
-        return Bench(robot, True, settings, WIDTH)
+        return bench_cache(self.robot).bench(series, True, WIDTH, settings)
 
     def stepped(self, work: Work, given: Given, more: Sequence[str] = ()) -> Made:
         """Step lanes of one run, whatever acts on them.

@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -328,3 +330,18 @@ def test_the_terminal_says_who_is_best_and_marks_a_tuner_whose_runs_all_failed(
         assert names[0].startswith("least_squares")
         assert names[-1].startswith("failing [all runs failed]")
     assert len(tables) == 2
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glfw asks on Linux")
+def test_a_command_names_the_library_that_glfw_would_choose(monkeypatch):
+    """Else each import of MuJoCo starts an interpreter to ask for its version."""
+    pytest.importorskip("glfw")
+    for name in ("PYGLFW_LIBRARY", "PYGLFW_LIBRARY_VARIANT", "XDG_SESSION_TYPE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "argv", ["simgap", "list"])
+    main()
+    named = os.environ.pop("PYGLFW_LIBRARY")
+    assert named == str(Path(find_spec("glfw").origin).parent / "x11" / "libglfw.so")
+    monkeypatch.setenv("PYGLFW_LIBRARY", "mine.so")
+    main()
+    assert os.environ["PYGLFW_LIBRARY"] == "mine.so"

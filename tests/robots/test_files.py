@@ -34,14 +34,15 @@ CASES = {
     ),
     "pybullet_data cartpole.urdf": Case(
         "pybullet_data", "cartpole.urdf", (motor("m_slider_to_cart", "slider_to_cart"),),
-        (0.0, math.pi), (4.0,), {"drag.linear@cart_to_pole": (0.2,)}, engine=FINE,
+        (0.0, math.pi), (4.0,), {"drag.linear@cart_to_pole": (0.2,)}, seconds=3.0, runs=4,
+        engine=FINE,
     ),
     "pybullet_data kuka_iiwa": Case(
         "pybullet_data", "kuka_iiwa/model.urdf",
         tuple(Drive(name, "position", kp, 0.1 * kp, 300.0)
               for name, kp in zip(IIWA, (900, 900, 400, 400, 60, 60, 8), strict=True)),
         (0.0, 0.5, 0.0, -1.2, 0.0, 0.8, 0.0), (0.5,) * 7, {"input.delay@m_" + IIWA[3]: (0.006,)},
-        seconds=2.0, runs=3, engine=FINE,
+        seconds=1.2, runs=3, engine=FINE,
     ),
     "example-robot-data double pendulum": Case(
         "pinocchio", "double_pendulum_description/urdf/double_pendulum_simple.urdf",
@@ -53,7 +54,7 @@ CASES = {
         tuple(Drive(name, "position", kp, 0.08 * kp, 10.0)
               for name, kp in zip(SO101, (0.08, 0.15, 0.5, 2.0, 6.0, 4.0), strict=True)),
         (0.0, -0.4, 0.4, 0.3, 0.2, 0.3), (0.4,) * 6, {"friction.coulomb@elbow_flex": (0.02,)},
-        seconds=3.0, runs=3, engine=FINE,
+        seconds=1.5, runs=3, engine=FINE,
     ),
 }  # fmt: skip
 

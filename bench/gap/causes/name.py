@@ -20,7 +20,7 @@ from bench.gap.causes.search import Search
 from bench.gap.causes.settle import rivals, settle
 from bench.gap.causes.structure import Remains, remains, unasked
 from bench.gap.causes.trial import Trial
-from bench.gap.held_out import HeldOutRuns, Measured
+from bench.gap.held_out import Measured, Validation
 from bench.gap.measure import covariance
 from bench.gap.model.models import Model, Names
 from bench.gap.model.watch import Cut, EndedError
@@ -55,12 +55,13 @@ class Finding:
     cut: Cut | None = None
 
 
-def name(search: Search, held_out: HeldOutRuns | None) -> Finding:
+def name(search: Search, held_out: Validation | None) -> Finding:
     """Search, check on held-out runs, collect alternatives, and judge.
 
     Args:
         search: with the base model entered.
-        held_out: the runs for measuring; None if there are none.
+        held_out: predicts held-out runs, or each run by cross-validation; None if there are
+            neither.
     """
     inquiry = _inquiry(search, held_out)
     try:
@@ -69,7 +70,7 @@ def name(search: Search, held_out: HeldOutRuns | None) -> Finding:
         return inquiry.so_far()
 
 
-def _inquiry(search: Search, held_out: HeldOutRuns | None) -> Inquiry:
+def _inquiry(search: Search, held_out: Validation | None) -> Inquiry:
     """Questions about a robot are asked by prediction errors."""
     if not search.world.linear:
         return Inquiry(search, held_out)
@@ -86,10 +87,11 @@ class Inquiry:
 
     Args:
         search: with the base model entered.
-        held_out: the runs for measuring; None if there are none.
+        held_out: predicts held-out runs, or each run by cross-validation; None if there are
+            neither.
     """
 
-    def __init__(self, search: Search, held_out: HeldOutRuns | None) -> None:
+    def __init__(self, search: Search, held_out: Validation | None) -> None:
         self._search = search
         self._held_out = held_out
         self._watch = search.world.watch
@@ -230,7 +232,7 @@ def unfixed(search: Search, base: Model) -> tuple[str, ...]:
     return tuple(name for _, name in sorted(vague, key=lambda one: -one[0]))
 
 
-def _trial(search: Search, model: Model, held_out: HeldOutRuns) -> Trial:
+def _trial(search: Search, model: Model, held_out: Validation) -> Trial:
     """On held-out runs: the base model, the best ones with one effect, and all that are near the
     one found.
     """

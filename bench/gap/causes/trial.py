@@ -1,5 +1,8 @@
 """What held-out runs say about the models of a search: they have a veto and a voice.
 
+Where runs are too few to hold one out, each is predicted by fits to the others
+(`bench.gap.cross_validation`), and counts as held out.
+
 An effect that makes them worse goes. A gap that only they show is something that the model has not
 learnt. And between models that explain the fitted runs alike, their likelihood counts too.
 """
@@ -14,7 +17,7 @@ import numpy as np
 from bench.gap.causes.rules import NOTICED, explains, helps, is_alike, is_missed, ratio_of
 from bench.gap.causes.search import IDLE, Search
 from bench.gap.causes.structure import Remains
-from bench.gap.held_out import HeldOutRuns, Measured
+from bench.gap.held_out import Measured, Validation
 from bench.gap.model.models import Model, Names
 from sims.base import Array
 
@@ -27,18 +30,18 @@ class Trial:
     """Models on held-out runs.
 
     Attributes:
-        runs: the held-out runs.
+        runs: predicts the held-out runs, or each run by cross-validation.
         measured: the models that were tried there, by their effects.
     """
 
-    runs: HeldOutRuns
+    runs: Validation
     measured: dict[Names, Measured] = field(default_factory=dict)
 
     def measure(self, models: Iterable[Model]) -> None:
         """Try models, all at once: each is compared with the nearest of them."""
         # By effects, so that a model that is asked for twice is simulated once.
         chosen = {model.names: model for model in models}
-        results = self.runs.measure([model.fit.theta for model in chosen.values()])
+        results = self.runs.validate([model.fit for model in chosen.values()])
         self.measured.update(zip(chosen, results, strict=True))
 
     def excess(self, names: Names, sigma: Array | None = None) -> float:

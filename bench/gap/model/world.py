@@ -250,8 +250,10 @@ class World:
         if name not in self.channels:
             return 0.0
         values = self.observed[:, :, self.channels.index(name)]
+        # A run without a sample of the channel has no range.
+        values = values[np.isfinite(values).any(axis=1)]
         ranges = np.nanmax(values, axis=1) - np.nanmin(values, axis=1)
-        return float(np.nan_to_num(ranges).max())
+        return float(ranges.max(initial=0.0))
 
     def _delaying(self) -> tuple[Indices, Indices]:
         """Where coefficients stand that move instants, and that need every step: such lanes are

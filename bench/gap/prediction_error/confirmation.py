@@ -18,7 +18,7 @@ from bench.gap.causes.name import Finding, Inquiry, closed, shows_nothing, unfix
 from bench.gap.causes.rules import State, is_unexplained, verdict_of
 from bench.gap.causes.structure import remains
 from bench.gap.causes.trial import Trial
-from bench.gap.held_out import HeldOutRuns
+from bench.gap.held_out import Validation
 from bench.gap.model.models import Model
 from bench.gap.model.watch import EndedError
 from bench.gap.prediction_error.search import PredictionErrorSearch
@@ -32,7 +32,7 @@ class Confirmation(Inquiry):
         held_out: the runs for measuring; None if there are none.
     """
 
-    def __init__(self, search: PredictionErrorSearch, held_out: HeldOutRuns | None) -> None:
+    def __init__(self, search: PredictionErrorSearch, held_out: Validation | None) -> None:
         super().__init__(search, held_out)
         self._robot = search
 

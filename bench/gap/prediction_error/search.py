@@ -20,9 +20,9 @@ import numpy as np
 
 from bench.gap.causes.candidates import Probe, _first
 from bench.gap.causes.gains import Group
-from bench.gap.causes.score_test import Scores
 from bench.gap.causes.joint_hats import JointHat
 from bench.gap.causes.rules import SWITCH
+from bench.gap.causes.score_test import Scores
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import hat_probes
 from bench.gap.friction_form import (

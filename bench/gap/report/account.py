@@ -291,10 +291,11 @@ def gain(story: Story) -> str:
     base = _error(story, held_out.rmse_base)
     extended = _error(story, held_out.rmse_extended)
     perfect = f"{PERFECT} {_error(story, held_out.noise_floor)}"
+    runs = story.validation_runs
     # Without a cause the extended model is the base model: there is no after.
     if not story.verdict.causes:
-        return f"On held-out runs the tuned simulation errs by {base} (RMSE); {perfect}."
-    errors = f"the error on held-out runs (RMSE) is {base} before and {extended} after; {perfect}."
+        return f"On {runs} the tuned simulation errs by {base} (RMSE); {perfect}."
+    errors = f"the error on {runs} (RMSE) is {base} before and {extended} after; {perfect}."
     if not closes(held_out):
         return errors[0].upper() + errors[1:]
     share = f"{percent(held_out.gap_closed)} of the gap{interval(held_out)}"
@@ -340,7 +341,7 @@ def _fitted_gain(story: Story) -> str:
     caution = "No run is held out, so the gain is not measured independently"
     found = story.verdict.cut
     if found is not None and "held_out" in found.not_asked:
-        caution = "The gain was not measured on held-out runs"
+        caution = f"The gain was not measured on {story.validation_runs}"
     return f"{caution}; on the fitted runs {error}."
 
 

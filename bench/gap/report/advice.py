@@ -127,8 +127,8 @@ def _further(story: Story) -> Iterator[str]:
     elif verdict in ("partial", "unknown"):
         if verdict == "partial" and story.held_out is not None and not story.thorough:
             yield paragraph(
-                "To have the library searched further for what remains, judged by the held-out "
-                "runs (about twice as long):"
+                "To have the library searched further for what remains, judged by the "
+                f"{story.validation_runs} (about twice as long):"
             )
             yield command("simgap", "explain", _recording(story), "--thorough")
         yield paragraph(

@@ -218,7 +218,9 @@ def _printed(p_value: float) -> str:
 def _notes(story: Story, shown: Sequence[Candidate]) -> list[str]:
     """What the figure counts, and the p-values that are not printed beside their bars."""
     counts = f"Fitted: {_counted(story.fitting)}"
-    if story.held_out is not None:
+    if story.held_out is not None and story.cross_validated:
+        counts += "; each run left out in turn"
+    elif story.held_out is not None:
         counts += f"; held out: {_counted(story.held_out)}"
     notes = [f"{counts}."]
     what = "p: probability of such a score by chance"
@@ -233,7 +235,7 @@ def _notes(story: Story, shown: Sequence[Candidate]) -> list[str]:
     notes.append(f"{what}.")
     missing = sum(candidate.heldout_gain is None for candidate in shown)
     if 0 < missing < len(shown):
-        notes[1] += " Without a mark: not simulated on held-out runs."
+        notes[1] += f" Without a mark: not simulated on {story.validation_runs}."
     return notes
 
 

@@ -94,7 +94,7 @@ def candidates_grid(frame: Table) -> Grid:
     says = {
         "score": "evidence that the simulation lacks it: twice the gain in log likelihood",
         "p_value": "how probable as much evidence is by chance",
-        "heldout_gain": "share of the gap on held-out runs that it closes by itself",
+        "heldout_gain": "share of the gap on runs that no fit has seen that it closes by itself",
     }
     columns = tuple(
         Column(name, heads.get(name, name), digits.get(name, 0), says.get(name, ""))

@@ -287,7 +287,7 @@ def _finish(
     some = f"; the worst {len(rows)} of {total} joints and sensors" if len(rows) < total else ""
     # A sample counts once, however many channels it has.
     samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
-    kind = "held-out run" if shot.held_out else "run"
+    kind = f"{story.validation_run} run" if shot.held_out else "run"
     how = "that fits worst" if story.verdict.verdict == "adequate" else "with the largest gap"
     title = f"The {kind} {how}, joint by joint: {label(shot.side.names[shot.row])}"
     title += f" ({samples} samples{some})"

@@ -100,7 +100,9 @@ def _runs(story: Story) -> list[Drawn]:
     found = []
     for side in sides(story):
         squares = np.square((side.observed - side.before) / sigma)
-        use = ", held out" if side is story.held_out else ""
+        use = ""
+        if side is story.held_out:
+            use = ", left out" if story.cross_validated else ", held out"
         for row, name in enumerate(side.names):
             there = squares[row][np.isfinite(squares[row])]
             gap = float(np.sqrt(there.mean())) if there.size else 0.0

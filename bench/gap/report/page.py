@@ -94,7 +94,7 @@ _CAPTIONS = {
 }
 """Under the figures."""
 _SHARES = (
-    " Left: the share of the gap on held-out runs that each closes by itself, with its 95 % "
+    " Left: the share of the gap on {runs} that each closes by itself, with its 95 % "
     "interval, where it was simulated there."
 )
 """Under the candidates, where held-out runs were simulated with any of them."""
@@ -145,7 +145,7 @@ def page(story: Story, drawn: Mapping[str, Printed], folder: Path | None = None)
     made.section("trust", "Which number to trust", *agreement(story))
     faulty = bool(story.verdict.recording_faults)
     made.section("remains", "What remains", *(() if faulty else remains(story)))
-    made.section("reading", "How to read this", *reading())
+    made.section("reading", "How to read this", *reading(story))
     return made.html()
 
 
@@ -183,11 +183,12 @@ def _gain(story: Story) -> Iterator[str]:
             ("after", "after: with what was found", held_out.rmse_extended),
         ]
     rows.append(("floor", "noise floor", held_out.noise_floor))
-    yield '<section class="gain" aria-label="error on held-out runs">'
+    runs = story.validation_runs
+    yield f'<section class="gain" aria-label="error on {runs}">'
     if extended and closes(held_out):
         closed = strong(f"{percent(held_out.gap_closed)} of the gap closed")
         yield paragraph(closed + interval(held_out), "closed")
-    note = "Error on held-out runs (RMSE): shorter is better, the noise floor is best."
+    note = f"Error on {runs} (RMSE): shorter is better, the noise floor is best."
     yield paragraph(note, "soft")
     # Bars are shares of the longest: a simulation that failed has no error, and no bar.
     known = [value for _, _, value in rows if value is not None and isfinite(value)]
@@ -266,7 +267,7 @@ def _candidates(
     if "candidates" in stills:
         caption = _CAPTIONS["candidates"] + (_PLACED if has_places(story) else "")
         if any(c.heldout_gain is not None for c in story.verdict.candidates):
-            caption += _SHARES
+            caption += _SHARES.format(runs=story.validation_runs)
         yield made.picture("candidates-picture", stills["candidates"], caption, [CANDIDATES])
     if not story.verdict.candidates:
         yield paragraph("No candidate was tried.")

@@ -164,7 +164,7 @@ def _overview(story: Story) -> Figure:
         _signal(axes[0][column], axes[1][column], story, shot, c)
     # A sample counts once, however many channels it has.
     samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
-    kind = "held-out run" if shot.held_out else "run"
+    kind = f"{story.validation_run} run" if shot.held_out else "run"
     how = "that fits worst" if story.verdict.verdict == "adequate" else "with the largest gap"
     some = f"; {count} of {len(story.channels)} channels" if count < len(story.channels) else ""
     title = f"The {kind} {how}: {label(shot.side.names[shot.row])} ({samples} samples{some})"

@@ -41,6 +41,10 @@ _READING = {
         "the simulation with its own parameters tuned; the same with what was found, tuned again."
     ),
     "held-out runs": "runs on which nothing was fitted but where they begin.",
+    "runs left out in turn": (
+        "each run, predicted by a fit to the others (cross-validation); what is reported is fitted"
+        " to all runs."
+    ),
     "interval": "95 %: where the true value lies 19 times in 20, as far as the model is right.",
     "score, p": (
         "evidence for a cause, and how probable as much is by chance where nothing is missing."
@@ -66,7 +70,7 @@ def channels(story: Story) -> Iterator[str]:
     """The channels with their noise and their errors in their own units."""
     extended = bool(story.verdict.causes)
     whens = (" before", " after") if extended else ("",)
-    kinds = [("fitted", story.fitting), ("held-out", story.held_out)]
+    kinds = [("fitted", story.fitting), (story.validation_run, story.held_out)]
     there = [(name, side) for name, side in kinds if side is not None and len(side.names)]
     heads = ["channel", "-noise, 1σ", "known how"]
     heads += [f"-RMSE{when}, {name} runs" for name, _ in there for when in whens]
@@ -196,16 +200,21 @@ def remains(story: Story) -> Iterator[str]:
         yield listed(safe(sentence(text)) for text in story.remains)
         return
     # On held-out runs the residual owes nothing to the fit.
-    side, name = (story.held_out, "held-out") if story.held_out else (story.fitting, "fitted")
+    side, name = story.fitting, "fitted"
+    if story.held_out:
+        side, name = story.held_out, story.validation_run
     left = number(rms(story, side, "after"), 2)
     verdict = story.verdict.verdict if story.verdict.cut is None else "unidentifiable"
     what = _LEFT.get(verdict, "Nothing that stands out")
     yield paragraph(f"{what}: the residual of the {name} runs is {left} times the noise.")
 
 
-def reading() -> Iterator[str]:
+def reading(story: Story) -> Iterator[str]:
     """The words of the page."""
     yield "<dl>"
+    validations = {"held-out runs", "runs left out in turn"}
     for word, meaning in _READING.items():
+        if word in validations - {story.validation_runs}:
+            continue
         yield f"<dt>{word}</dt><dd>{meaning}</dd>"
     yield "</dl>"

@@ -152,6 +152,8 @@ class Story:
         track: the picture of a film's track (PNG), of a recording that was tracked; empty for none.
         logs: recordings that are explained together.
         thorough: whether all has been searched that can be.
+        cross_validated: whether `held_out` has all runs, each predicted by fits to the others,
+            since they were too few to hold one out.
         share_intervals: 95 % interval of the share of the held-out gap that each effect closes
             alone, by its name, where that was simulated.
     """
@@ -176,4 +178,15 @@ class Story:
     track: bytes = b""
     logs: int = 1
     thorough: bool = False
+    cross_validated: bool = False
     share_intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def validation_runs(self) -> str:
+        """Name the runs of `held_out` in a sentence."""
+        return "runs left out in turn" if self.cross_validated else "held-out runs"
+
+    @property
+    def validation_run(self) -> str:
+        """Return the word that goes before the name of a run of `held_out`."""
+        return "left-out" if self.cross_validated else "held-out"

@@ -320,7 +320,7 @@ def test_a_mass_beyond_its_declared_range_is_fitted_and_told(tmp_path):
         lines += [f"{run},{t:.4f},{push:.9g},{where:.9g}" for t, push, where in rows]
     (tmp_path / "heavy.csv").write_text("\n".join(lines) + "\n")
     units = '[inputs.u]\nunit = "N"\n[channels.x]\nunit = "m"\nnoise = 1e-3\n'
-    (tmp_path / "heavy.toml").write_text(f'system = "slider"\n{units}')
+    (tmp_path / "heavy.toml").write_text(f'system = "slider"\n{units}[runs.1]\nheld_out = true\n')
     found = explained(tmp_path / "heavy.csv")
     assert (found.verdict, found.causes, found.answer.recording_faults) == ("adequate", (), ())
     mass = found.answer.parameters["mass"]

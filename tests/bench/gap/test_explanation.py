@@ -113,8 +113,9 @@ def test_a_figure_looks_alike_shown_and_written(named, tmp_path):
     for name in named.figures:
         shown = named.figure(name)
         shown.savefig(tmp_path / "shown.png", dpi=DPI)
-        pixels = [matplotlib.image.imread(tmp_path / f"{n}.png") for n in (name, "shown")]
-        np.testing.assert_array_equal(*pixels)
+        written, seen = (matplotlib.image.imread(tmp_path / f"{n}.png") for n in (name, "shown"))
+        np.testing.assert_array_equal(written, seen[:, :, :3])
+        assert (seen[:, :, 3] == 1.0).all(), "the written file has no opacity"
 
 
 def test_it_is_written_into_a_folder_that_is_made(named, tmp_path):

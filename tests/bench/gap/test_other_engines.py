@@ -7,9 +7,9 @@ from bench.gap.explain import explain
 from tests.wishes import Wish, write
 
 CASES = {
-    "pendulum": ("drag.linear=6e-4", "mujoco", ("q",)),
-    "slider": ("friction.coulomb=0.4", "pybullet", ("x",)),
-    "ball": ("drag.quadratic=0.05", "mujoco", ("z",)),
+    "pendulum": ("drag.linear=6e-4", "mujoco", ("q",), 1.0, 30.0),
+    "slider": ("friction.coulomb=0.4", "pybullet", ("x",), 1.5, 40.0),
+    "ball": ("drag.quadratic=0.05", "mujoco", ("z",), 1.0, 30.0),
 }
 
 
@@ -17,15 +17,15 @@ CASES = {
 @pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
 @pytest.mark.parametrize("system", CASES)
 def test_the_same_cause_is_named(system, engine, tmp_path):
-    effect, source, observe = CASES[system]
+    effect, source, observe, seconds, rate = CASES[system]
     wish = Wish(
         system,
         effects=[effect],
         noise=["0.004"],
         observe=observe,
         runs=3,
-        seconds=1.5,
-        rate=40.0,
+        seconds=seconds,
+        rate=rate,
         engine=source,
         seed=3,
     )

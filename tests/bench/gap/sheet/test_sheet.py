@@ -85,7 +85,7 @@ def test_what_the_data_resolve_is_what_least_squares_says(sheet: DataSheet) -> N
     """
     reach = row(sheet, "sensor.bias").reach
     assert reach is not None
-    mean = 1.96 * NOISE / np.sqrt(2 * SAMPLES)
+    mean = 1.96 * NOISE / np.sqrt(3 * SAMPLES)
     assert mean < reach.size < 30 * mean
 
 

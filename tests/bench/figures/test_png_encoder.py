@@ -1,0 +1,28 @@
+"""PNG files are what Pillow reads as the same pixels, and as large as the figure asks for."""
+
+from io import BytesIO
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bench.figures.png_encoder import encoded_png
+from bench.figures.style import blank, png
+
+
+def test_pixels_and_dots_an_inch_are_kept():
+    rgba = np.random.default_rng(0).integers(0, 256, (7, 5, 4), dtype=np.uint8)
+    with Image.open(BytesIO(encoded_png(rgba.tobytes(), 7, 5, 160.0))) as image:
+        assert (image.format, image.mode, image.size) == ("PNG", "RGB", (5, 7))
+        assert image.info["dpi"] == pytest.approx((160.0, 160.0), abs=0.1)
+        np.testing.assert_array_equal(np.asarray(image), rgba[:, :, :3])
+
+
+@pytest.mark.parametrize("size", [(10.6875, 4.9700000000000006), (3.14159, 2.71828), (1.07, 1.01)])
+def test_a_figure_is_what_matplotlib_writes(size):
+    figure, axes = blank(1, 1, size, layout=None)
+    axes[0, 0].plot([0, 1], [0, 1])
+    expected = BytesIO()
+    figure.savefig(expected, format="png", dpi=150)
+    with Image.open(expected) as a, Image.open(BytesIO(png(figure, 150))) as b:
+        np.testing.assert_array_equal(np.asarray(a)[:, :, :3], np.asarray(b))
