@@ -139,8 +139,9 @@ def remains(models: Models, model: Model) -> Remains:
         return quick
     world.watch.look("a force of any shape")
     known = models.force_of_any_shape(model)
-    if known is not None:
-        level = level_of(bool(stated.all()))
+    level = level_of(bool(stated.all()))
+    # The innovations are linear in such a force; where they show one, it is simulated.
+    if known is not None and known[0] > level:
         return Remains(known[0], known[1], quick.excess, quick.loud, level)
     model = models.exact(model)
     directions = hats(world, model)
@@ -157,7 +158,6 @@ def remains(models: Models, model: Model) -> Remains:
     )
     promise = scores.score - scores.chance
     where = scores.effects[int(np.argmax(promise))]
-    level = level_of(bool(stated.all()))
     return Remains(scores.p_value, where, quick.excess, quick.loud, level)
 
 

@@ -131,6 +131,7 @@ class FollowedRuns:
         noise: Noise,
         trajectories: Sequence[Trajectory] | None,
         simulator: RobotSimulator | None = None,
+        force: Array | None = None,
     ) -> FollowedRuns:
         """Linearise a model about the measured motion and filter the runs.
 
@@ -140,10 +141,10 @@ class FollowedRuns:
             noise: of the sensors.
             trajectories: the motion of each run, if it has been estimated before.
             simulator: in place of that of the world.
+            force: (E,) missing forces with which the fit of the process noise begins.
         """
         again = RELINEARISED if trajectories is None else 1
         followed: FollowedRuns | None = None
-        force: Array | None = None
         linear: list[MeasuredLinear] = []
         for _ in range(again):
             # Jacobians change little from one motion to another near the data.

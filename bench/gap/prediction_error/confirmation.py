@@ -69,7 +69,7 @@ class Confirmation(Inquiry):
             causes=len(causes),
             alternatives=any(cause.alternatives for cause in causes),
             closed=closed(search, model, left),
-            unexplained=is_unexplained(left.structure, search.scan(model).p_value),
+            unexplained=is_unexplained(left.structure, search.lacks(model)),
             missed=trial is not None and trial.misses(model, left),
         )
         return self._finding(verdict_of(state), base, model, causes, left)

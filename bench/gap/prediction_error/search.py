@@ -17,11 +17,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtrc
 
 from bench.gap.causes.candidates import Probe, _first
 from bench.gap.causes.gains import Group
 from bench.gap.causes.joint_hats import JointHat
-from bench.gap.causes.rules import SWITCH
+from bench.gap.causes.rules import ALPHA, SWITCH
 from bench.gap.causes.score_test import Scores
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import hat_probes
@@ -40,6 +41,8 @@ from bench.gap.prediction_error.identification import Selected, identify, regres
 from bench.gap.prediction_error.null_distribution import null_scores
 from bench.gap.prediction_error.selection import Regression
 from sims.base import Array
+from sims.robot.forces import OVER_TIME
+from sims.robot.native import FIELDS
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
 from sims.simulated import Simulated
@@ -63,6 +66,14 @@ RIVAL = 30.0
 """Rivals this near in twice the log likelihood of the regression are fitted by simulation."""
 MAX_RIVALS = 4
 """Maximum number of rivals of each effect that are fitted by simulation."""
+MAX_STEPS = 4
+"""Maximum number of effects that are added one after another."""
+TRIED = 5
+"""Maximum number of effects that are tried in the model at each step."""
+PROMISING = 0.3
+"""Share of the largest gain by regression that an effect must have to be tried in the model."""
+REFINED = 1
+"""Number of Gauss-Newton steps for an effect that is tried in the model."""
 MOVED = 0.02
 """Share of a coefficient by which it is moved for its derivative."""
 SILENT = 0.03
@@ -97,10 +108,19 @@ class PredictionErrorSearch(Search):
         watch.stage("selecting effects", 1)
         selected = identify(followed, columns)
         self.selections.append(selected)
-        plain, softer = self._form_of_friction(selected)
-        best = self._confirmed(selected, self.base, plain)
-        if softer and not self._is_explained(best) and self._is_softer(best):
-            raise SoftFrictionError
+        needs = bool((selected.followed.needs_process_noise() > NEEDED).any())
+        plain, softer = self._form_of_friction(selected) if needs else ((), False)
+        best = self.base
+        if plain:
+            best = self._step_by_step(selected, plain)
+            if softer and not self._is_explained(best) and self._is_softer(best):
+                raise SoftFrictionError
+        elif not needs or not self._is_slow(selected):
+            best = self._confirmed(selected, best)
+        if not plain and not self._is_explained(best) and not self._is_cut:
+            best = max(best, self._step_by_step(selected, ()), key=lambda model: model.merit)
+        if not best.names and selected.groups:
+            best = self._confirmed(selected, best)
         if not self._is_explained(best):
             needed = selected.followed.needs_process_noise() > NEEDED
             joints = {int(j) for j in np.flatnonzero(needed)}
@@ -114,6 +134,162 @@ class PredictionErrorSearch(Search):
                 best = max(best, self._confirmed(selected, best), key=lambda model: model.merit)
         self.supported = best
         return best
+
+    def _is_slow(self, selected: Selected) -> bool:
+        """Whether a set is slow to simulate, as forces that are asked for in every step are."""
+        effects = [self.world.effects[name] for name in selected.effects]
+        return any(m.of not in FIELDS for e in effects for m in _members(e) if _is_force(m))
+
+    # -- selection with the model linearised again after each effect
+
+    def _step_by_step(self, selected: Selected, begin: Sequence[str]) -> Model:
+        """Add effects one after another, each chosen by whole filters with the effect in the model.
+
+        Where much is missing, the noise of the measured motion is in the innovations and in the
+        responses of effects that follow the same readings, and regression prefers these. A filter
+        with the right effect in the model needs no process noise any more.
+
+        Args:
+            selected: what regression has selected.
+            begin: dry friction that is in the model from the beginning.
+        """
+        theta, names = self.base.fit.theta.copy(), list(begin)
+        followed = self.follow()
+        likelihood = float(followed.filtered.log_likelihood.sum())
+        if names:
+            own = self._plain_theta(self._start(selected.groups, selected.coefficients))
+            for name in names:
+                theta[self.world.slots[name]] = own[self.world.slots[name]]
+            theta, followed, likelihood = self._refined(theta, names)
+        watch = self.world.watch
+        for _ in range(MAX_STEPS):
+            watch.stage("testing effects in the model one by one", TRIED)
+            tried = []
+            for name, start in self._promising(followed, theta, names):
+                tried.append((*self._refined(start, [*names, name]), name))
+                watch.advance()
+                watch.check()
+            if not tried:
+                break
+            found, own, best, name = max(tried, key=lambda one: 2.0 * one[2] - self._price(one[3]))
+            if 2.0 * (best - likelihood) < self._price(name):
+                break
+            theta, followed, likelihood = found, own, best
+            contained = self.world.effects[name].contains
+            names = [n for n in names if n not in contained] + [name]
+            if not (followed.needs_process_noise() > NEEDED).any():
+                break
+        if not names:
+            return self.base
+        self.refit([Start(tuple(names), theta, self.base.fit.states)], race=False)
+        fitted = self.models[frozenset(names)]
+        return self._lean(fitted) if np.isfinite(fitted.fit.cost) else self.base
+
+    def _lean(self, model: Model) -> Model:
+        """The model without effects that do not pay, and with one member in place of a family where
+        it does as well.
+        """
+        model = self.drop(model)
+        families = any(name.endswith("@*") for name in model.names)
+        return self.plainer(model) if families else model
+
+    def lacks(self, model: Model) -> float:
+        """Return the p-value of the effect that a fitted model seems to lack most; where the
+        innovations show one it is fitted by simulation, since they are linear in it.
+        """
+        scores = self.scan(model)
+        if scores.p_value > ALPHA or not np.isfinite(model.fit.cost):
+            return scores.p_value
+        name = scores.effects[0]
+        (group, coefficients), *_ = scores.peaks[0]
+        theta = model.fit.theta.copy()
+        contained = self.world.effects[name].contains
+        for other in contained:
+            theta[self.world.slots[other]] = 0.0
+        theta[self.world.slots[name]] = self._numbers(group, coefficients)
+        names = (*(n for n in model.names if n not in contained), name)
+        self.refit([Start(names, theta, model.fit.states)], race=False)
+        larger = self.models[frozenset(names)]
+        gain = max(larger.likelihood.value - model.likelihood.value, 0.0)
+        slot = self.world.slots[name]
+        return float(min(len(self.world.library) * chdtrc(slot.stop - slot.start, gain), 1.0))
+
+    def _price(self, name: str) -> float:
+        """What an effect must gain in twice the log likelihood."""
+        slot = self.world.slots[name]
+        return float((slot.stop - slot.start) * self.price + 2.0 * np.log(len(self.world.library)))
+
+    def _promising(
+        self, followed: FollowedRuns, theta: Array, names: Sequence[str]
+    ) -> list[tuple[str, Array]]:
+        """The effects that gain most beside those in the model, with parameters to begin with."""
+        columns = self._plain_columns()
+        probes = [p for n in names for p in self._tangents(n, theta[self.world.slots[n]])]
+        joined = columns.joined(followed.columns(probes)) if probes else columns
+        always = range(len(columns.probes), len(joined.probes))
+        regression = regress(followed, joined, always=always)
+        prices = np.array([regression.price(group) for group in regression.groups])
+        gains = regression.gains([]) - prices
+        found: dict[str, Array] = {}
+        for i in np.argsort(-gains, kind="stable").tolist():
+            group = regression.groups[i]
+            if group.effect in (*names, *found):
+                continue
+            if len(found) == TRIED or gains[i] < max(PROMISING * gains.max(), 0.0):
+                break
+            begun = theta.copy()
+            for contained in self.world.effects[group.effect].contains:
+                begun[self.world.slots[contained]] = 0.0
+            begun[self.world.slots[group.effect]] = self._numbers(
+                group, regression.solve([group])[1][0]
+            )
+            found[group.effect] = begun
+        return list(found.items())
+
+    def _refined(self, theta: Array, names: Sequence[str]) -> tuple[Array, FollowedRuns, float]:
+        """Improve coefficients by a Gauss-Newton step on the innovations, and follow again."""
+        world, motion = self.world, self.follow().trajectories()
+        noise = self.follow().noise
+        best: tuple[Array, FollowedRuns, float] | None = None
+        for turn in range(REFINED + 1):
+            force = self.follow().force if best is None else best[1].force
+            followed = FollowedRuns.follow(world, theta, noise, motion, force=force)
+            likelihood = float(followed.filtered.log_likelihood.sum())
+            if best is not None and likelihood < best[2]:
+                break
+            best = theta, followed, likelihood
+            if turn < REFINED:
+                theta = self._improved(followed, theta, names)
+        assert best is not None
+        return best
+
+    def _improved(self, followed: FollowedRuns, theta: Array, names: Sequence[str]) -> Array:
+        """The coefficients of effects after a Gauss-Newton step on the innovations."""
+        slots = self.world.slots
+        tangents = [self._tangents(name, theta[slots[name]]) for name in names]
+        responses = followed.responses(followed.columns([p for own in tangents for p in own]))
+        columns, steps, places, first = [], [], [], 0
+        for name, own in zip(names, tangents, strict=True):
+            c, place = theta[slots[name]], self.world.places(name)[0]
+            for k in range(c.size):
+                columns.append(responses[..., first + 1 + k] - responses[..., first])
+                steps.append(own[1 + k].c[k] - c[k])
+                places.append(place + k)
+            first += len(own)
+        rows = np.stack(columns, axis=-1).reshape(-1, len(columns)).astype(np.float64)
+        target = followed.filtered.whitened.reshape(-1)
+        solved = np.linalg.lstsq(rows, target, rcond=1e-8)[0]
+        result = theta.copy()
+        result[places] += solved * np.array(steps)
+        for name in names:
+            low, high = np.array(coefficient_bounds(self.world, name)).T
+            result[slots[name]] = np.clip(result[slots[name]], low, high)
+        return result
+
+    @property
+    def _is_cut(self) -> bool:
+        """Whether the search has to end."""
+        return bool(self.world.watch.left())
 
     def _is_softer(self, model: Model) -> bool:
         """Whether a fitted model with dry friction is likelier in MuJoCo's soft form."""
@@ -130,16 +306,18 @@ class PredictionErrorSearch(Search):
         other.close()
         return soft is not None
 
-    def _form_of_friction(self, selected: Selected) -> tuple[bool, bool]:
-        """Whether dry friction without a state follows the data as well as what was selected, and
+    def _form_of_friction(self, selected: Selected) -> tuple[tuple[str, ...], bool]:
+        """The dry friction without a state that follows the data as well as what was selected, and
         whether it does better in MuJoCo's soft form.
 
         The force of friction is not linear in its limit where a joint sticks or creeps, so whole
         models are followed.
         """
         world = self.world
-        if not has_dry_friction(world, selected.effects):
-            return False, False
+        plain_names = [plain_friction(world, name) for name in selected.effects]
+        native = [n for n in plain_names if n.partition("@")[0] in FIELDS]
+        if not has_dry_friction(world, native):
+            return (), False
         robot: Any = world.kind
         start = self._start(selected.groups, selected.coefficients)
         plain = self._plain_theta(start)
@@ -149,7 +327,9 @@ class PredictionErrorSearch(Search):
         softer = -np.inf if is_soft else self._likelihood(plain, soft_kind(world.kind))
         own = self._likelihood(start.theta, world.kind) if has_state else -np.inf
         best = max(likelihood, softer)
-        return best > own - 0.5 * SWITCH, softer > max(likelihood, own) + 0.5 * SWITCH
+        names = tuple(n for n in native if has_dry_friction(world, [n]))
+        stands = best > own - 0.5 * SWITCH
+        return names if stands else (), softer > max(likelihood, own) + 0.5 * SWITCH
 
     def _likelihood(self, theta: Array, kind: type[Simulated]) -> float:
         """The log likelihood of the innovations with a simulator and its parameters."""
@@ -158,7 +338,8 @@ class PredictionErrorSearch(Search):
         simulator = kind(world.recording.constants, world.channels, effects=effects)
         assert isinstance(simulator, RobotSimulator)
         motion = followed.trajectories()
-        own = FollowedRuns.follow(world, theta, followed.noise, motion, simulator)
+        force = followed.force
+        own = FollowedRuns.follow(world, theta, followed.noise, motion, simulator, force)
         return float(own.filtered.log_likelihood.sum())
 
     def _plain_theta(self, start: Start) -> Array:
@@ -202,8 +383,7 @@ class PredictionErrorSearch(Search):
     def _acts_at(self, name: str, joints: Iterable[int]) -> bool:
         """Whether an effect acts at one of some joints."""
         effect, coordinates = self.world.effects[name], self.world.simulator.system.coordinates
-        members: Sequence[Effect] = getattr(effect, "members", ()) or (effect,)
-        for member in members:
+        for member in _members(effect):
             if member.coordinate in joints:
                 return True
             if any(member.signal.partition(".")[2] == coordinates[j][2:] for j in joints):
@@ -212,25 +392,21 @@ class PredictionErrorSearch(Search):
 
     # -- fits by simulation
 
-    def _confirmed(self, selected: Selected, best: Model, plain: bool = False) -> Model:
+    def _confirmed(self, selected: Selected, best: Model) -> Model:
         """Fit the selected set by simulation, and leave out effects that do not pay there.
 
         Args:
             selected: the set.
             best: the best model so far.
-            plain: take dry friction for the laws with a state that contain it.
         """
         if not selected.groups:
             return best
         start = self._start(selected.groups, selected.coefficients)
-        if plain:
-            names = dict.fromkeys(plain_friction(self.world, n) for n in start.effects)
-            start = replace(start, effects=tuple(names), theta=self._plain_theta(start))
         self.refit([start], race=False)
         found = self.models[frozenset(start.effects)]
         if not np.isfinite(found.fit.cost):
             return best
-        found = self.drop(found)
+        found = self._lean(found)
         if selected.shows_steps:
             found = self._corrected(found)
         return found if found.merit > best.merit else best
@@ -346,8 +522,9 @@ class PredictionErrorSearch(Search):
             return followed
         key = self._key(model)
         if key not in self._followed:
+            motion, force = followed.trajectories(), followed.force
             found = FollowedRuns.follow(
-                self.world, model.fit.theta, followed.noise, followed.trajectories()
+                self.world, model.fit.theta, followed.noise, motion, force=force
             )
             numerics = self.selections[-1].numerics if self.selections else 0.0
             defects = found.runs.defects - numerics * found.runs.step_errors
@@ -419,3 +596,14 @@ class PredictionErrorSearch(Search):
         """Return the probability of the larger model's gain if nothing were missing."""
         gain = larger.likelihood.value - model.likelihood.value
         return self.gained(self.scan(model), larger, gain)
+
+
+def _members(effect: Effect) -> Sequence[Effect]:
+    """The members of a family; any other effect alone."""
+    members: Sequence[Effect] = getattr(effect, "members", ()) or (effect,)
+    return members
+
+
+def _is_force(effect: Effect) -> bool:
+    """Whether an effect is a force that is asked for in every step, or has states of its own."""
+    return effect.hook in ("force", "hidden") and effect.of not in OVER_TIME

@@ -44,6 +44,8 @@ AR_FLOOR = 1e-3
 """White part of AR(1) noise, as a share of its variance, so that no reading is exact."""
 LARGEST_CHANGE = 10.0
 """Largest factor by which an iteration of (7) changes a variance."""
+SEGMENT = 80
+"""Number of samples of a segment on which the process noise is fitted."""
 ITERATIONS = 12
 """Maximum number of iterations of (7)."""
 CONVERGED = 0.15
@@ -90,6 +92,31 @@ class LinearRuns:
             self.recorded[chosen],
             self.prior,
             self.step_errors[chosen],
+        )
+
+    def segments(self, length: int) -> LinearRuns:
+        """Cut the runs into segments of so many samples, each with the prior of a run."""
+        number, samples, _ = self.residuals.shape
+        count = -(-samples // length)
+
+        def cut(values: Array, last: bool) -> Array:
+            shape = (number, count * length, *values.shape[2:])
+            padded = np.zeros(shape, dtype=values.dtype)
+            padded[:, : values.shape[1]] = values
+            parts = padded.reshape(number * count, length, *values.shape[2:])
+            return parts if last else parts[:, :-1]
+
+        recorded: Mask = cut(self.recorded, True)
+        return LinearRuns(
+            cut(self.states, False),
+            cut(self.defects, False),
+            cut(self.forces, False),
+            cut(self.inputs, False),
+            cut(self.readings, True),
+            cut(self.residuals, True),
+            recorded,
+            self.prior,
+            cut(self.step_errors, False),
         )
 
     @classmethod
@@ -320,15 +347,21 @@ def fit_process_noise(
         typical: (E,) typical forces, which set the smallest deviations.
     """
     count = force.size
+    # Shorter segments side by side take fewer steps, and show the same process noise.
+    long = runs.residuals.shape[1] > 2 * SEGMENT
+    short = runs.segments(SEGMENT) if long else runs
     for _ in range(ITERATIONS):
-        filtered = filter_runs(runs, force, white)
-        smoothed = smooth_runs(runs, filtered, force)
+        filtered = filter_runs(short, force, white)
+        smoothed = smooth_runs(short, filtered, force)
         ratio = np.clip(np.sqrt(smoothed.score[:count]), 1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
         changed = np.maximum(force * ratio, SMALLEST_FORCE * typical)
         done = bool((np.abs(changed / force - 1.0) < CONVERGED).all())
         if done:
             break
         force = changed
+    if long:
+        filtered = filter_runs(runs, force, white)
+        smoothed = smooth_runs(runs, filtered, force)
     return force, filtered, smoothed
 
 
