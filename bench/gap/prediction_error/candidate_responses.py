@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.gap.causes.candidates import Probe
+from bench.gap.model.differences import followed
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
 from bench.gap.prediction_error.measured_states import measured_states
@@ -144,7 +145,7 @@ class FollowedRuns:
             force: (E,) missing forces with which the fit of the process noise begins.
         """
         again = RELINEARISED if trajectories is None else 1
-        followed: FollowedRuns | None = None
+        found: FollowedRuns | None = None
         linear: list[MeasuredLinear] = []
         for _ in range(again):
             # Jacobians change little from one motion to another near the data.
@@ -156,11 +157,11 @@ class FollowedRuns:
                 for run, near in enumerate(nearby)
             ]
             maps = [one.interval_maps() for one in linear]
-            followed = cls._filtered(world, theta, noise, linear, maps, force)
-            force, noise = followed.force, followed.noise
-            trajectories = followed.trajectories()
-        assert followed is not None
-        return followed
+            found = cls._filtered(world, theta, noise, linear, maps, force)
+            force, noise = found.force, found.noise
+            trajectories = found.trajectories()
+        assert found is not None
+        return found
 
     @classmethod
     def _filtered(
@@ -178,8 +179,8 @@ class FollowedRuns:
         typical = np.concatenate([scales(robot).force, floating_forces(robot)])
         runs = LinearRuns.stacked(maps, world.observed, _prior(world, size))
         begin = FIRST_FORCE * typical if force is None else force
-        followed = cls(world, theta, noise, linear, runs, begin, _NONE, _NOTHING, typical)
-        return followed.refitted(runs)
+        begun = cls(world, theta, noise, linear, runs, begin, _NONE, _NOTHING, typical)
+        return begun.refitted(runs)
 
     def refitted(self, runs: LinearRuns) -> FollowedRuns:
         """Return the filter of changed linear models, with the process noise and the correlation
@@ -285,11 +286,12 @@ class FollowedRuns:
         result = np.zeros((number, samples, channels, count))
         s = np.zeros((number, size, own.size))
         s[:, own, np.arange(own.size)] = 1.0
-        for i in range(samples):
-            result[:, i, :, : own.size] = self.runs.readings[:, i] @ s
-            if i + 1 < samples:
-                s = self.runs.states[:, i] @ s
-        result[~np.isfinite(result)] = 0.0
+        with np.errstate(all="ignore"):
+            for i in range(samples):
+                result[:, i, :, : own.size] = self.runs.readings[:, i] @ s
+                if i + 1 < samples:
+                    s = self.runs.states[:, i] @ s
+        result[~followed(result)] = 0.0
         return result
 
     def output_sensitivities(self, probes: Sequence[Probe]) -> Array:
@@ -301,11 +303,13 @@ class FollowedRuns:
         size = self.runs.prior.size
         result = np.zeros((number, samples, channels, count))
         s = np.zeros((number, size, count))
-        for i in range(samples):
-            result[:, i] = columns.readings[:, i] + self.runs.readings[:, i] @ s
-            if i + 1 < samples:
-                s = self.runs.states[:, i] @ s + self.runs.inputs[:, i] @ columns.pushed[:, i]
-        result[~np.isfinite(result)] = 0.0
+        a, by = self.runs.states, self.runs.inputs
+        with np.errstate(all="ignore"):
+            for i in range(samples):
+                result[:, i] = columns.readings[:, i] + self.runs.readings[:, i] @ s
+                if i + 1 < samples:
+                    s = a[:, i] @ s + by[:, i] @ columns.pushed[:, i]
+        result[~followed(result)] = 0.0
         return result[..., columns.places] / columns.sizes
 
     def first_states(self) -> Array:

@@ -64,6 +64,8 @@ NEEDED = 20.0
 """Twice the log likelihood that the process noise of a joint must gain to be needed there."""
 RIVAL = 30.0
 """Rivals this near in twice the log likelihood of the regression are fitted by simulation."""
+LINEAR = 0.015
+"""Share of a gain by which it may be wrong, since responses are linear."""
 MAX_RIVALS = 4
 """Maximum number of rivals of each effect that are fitted by simulation."""
 MAX_STEPS = 4
@@ -108,32 +110,64 @@ class PredictionErrorSearch(Search):
         watch.stage("selecting effects", 1)
         selected = identify(followed, columns)
         self.selections.append(selected)
-        needs = bool((selected.followed.needs_process_noise() > NEEDED).any())
-        plain, softer = self._form_of_friction(selected) if needs else ((), False)
-        best = self.base
-        if plain:
-            best = self._step_by_step(selected, plain)
-            if softer and not self._is_explained(best) and self._is_softer(best):
-                raise SoftFrictionError
-        elif not needs or not self._is_slow(selected):
-            best = self._confirmed(selected, best)
-        if not plain and not self._is_explained(best) and not self._is_cut:
-            best = max(best, self._step_by_step(selected, ()), key=lambda model: model.merit)
-        if not best.names and selected.groups:
-            best = self._confirmed(selected, best)
+        best = self._of_friction(selected)
         if not self._is_explained(best):
-            needed = selected.followed.needs_process_noise() > NEEDED
-            joints = {int(j) for j in np.flatnonzero(needed)}
-            rich = [n for n in self.world.library if self._is_rich(n) and self._acts_at(n, joints)]
-            if rich:
-                watch.stage(f"testing {len(rich)} effects with many shapes", 1)
-                columns = columns.joined(followed.columns(self._probes(rich)))
-                self._columns = columns
-                selected = identify(followed, columns)
-                self.selections.append(selected)
-                best = max(best, self._confirmed(selected, best), key=lambda model: model.merit)
+            best = self._better(best, self._fitted(selected))
+        if not self._is_explained(best):
+            selected = self._with_many_shapes(selected)
+            best = self._better(best, self._fitted(selected))
+        if not self._is_explained(best) and not self._is_cut:
+            best = self._better(best, self._step_by_step(selected, ()))
+        if not best.names:
+            best = self._confirmed(selected)
         self.supported = best
         return best
+
+    @staticmethod
+    def _better(one: Model, other: Model) -> Model:
+        return max(one, other, key=lambda model: model.merit)
+
+    def _of_friction(self, selected: Selected) -> Model:
+        """The fitted model that begins with the dry friction of a selection; the base model where
+        nothing is missing beside what was selected, or where friction was not.
+
+        Raises:
+            SoftFrictionError: the friction has MuJoCo's soft form.
+        """
+        if not self._needs_noise(selected):
+            return self.base
+        plain, softer = self._form_of_friction(selected)
+        if not plain:
+            return self.base
+        best = self._step_by_step(selected, plain)
+        if softer and not self._is_explained(best) and self._is_softer(best):
+            raise SoftFrictionError
+        return best
+
+    def _needs_noise(self, selected: Selected) -> bool:
+        """Whether forces are still missing beside what was selected."""
+        return bool((selected.followed.needs_process_noise() > NEEDED).any())
+
+    def _fitted(self, selected: Selected) -> Model:
+        """The selected set fitted by simulation, where that is quick or promises to end the search;
+        else the base model.
+        """
+        if self._is_slow(selected) and self._needs_noise(selected):
+            return self.base
+        return self._confirmed(selected)
+
+    def _with_many_shapes(self, selected: Selected) -> Selected:
+        """Select again with effects of many shapes, at the joints where a force is missing."""
+        joints = {int(j) for j in np.flatnonzero(selected.followed.needs_process_noise() > NEEDED)}
+        rich = [n for n in self.world.library if self._is_rich(n) and self._acts_at(n, joints)]
+        if not rich:
+            return selected
+        self.world.watch.stage(f"testing {len(rich)} effects with many shapes", 1)
+        followed = self.follow()
+        self._columns = self._plain_columns().joined(followed.columns(self._probes(rich)))
+        found = identify(followed, self._columns)
+        self.selections.append(found)
+        return found
 
     def _is_slow(self, selected: Selected) -> bool:
         """Whether a set is slow to simulate, as forces that are asked for in every step are."""
@@ -189,9 +223,28 @@ class PredictionErrorSearch(Search):
         """The model without effects that do not pay, and with one member in place of a family where
         it does as well.
         """
-        model = self.drop(model)
+        model = self._as_families(self.drop(model))
         families = any(name.endswith("@*") for name in model.names)
         return self.plainer(model) if families else model
+
+    def _as_families(self, model: Model) -> Model:
+        """The model with a family in place of all its members, which cost more one by one."""
+        for family in (n for n in self.world.library if n.endswith("@*")):
+            members = [member.name for member in _members(self.world.effects[family])]
+            if len(members) < 2 or not set(members) <= set(model.names):
+                continue
+            theta = model.fit.theta.copy()
+            own = np.concatenate([theta[self.world.slots[name]] for name in members])
+            slot = self.world.slots[family]
+            if own.size != slot.stop - slot.start:
+                continue
+            for name in members:
+                theta[self.world.slots[name]] = 0.0
+            theta[slot] = own
+            names = (*(n for n in model.names if n not in members), family)
+            self.refit([Start(names, theta, model.fit.states)], race=False)
+            model = self._better(self.models[frozenset(names)], model)
+        return model
 
     def lacks(self, model: Model) -> float:
         """Return the p-value of the effect that a fitted model seems to lack most; where the
@@ -392,24 +445,19 @@ class PredictionErrorSearch(Search):
 
     # -- fits by simulation
 
-    def _confirmed(self, selected: Selected, best: Model) -> Model:
-        """Fit the selected set by simulation, and leave out effects that do not pay there.
-
-        Args:
-            selected: the set.
-            best: the best model so far.
-        """
+    def _confirmed(self, selected: Selected) -> Model:
+        """Fit the selected set by simulation, and leave out effects that do not pay there."""
         if not selected.groups:
-            return best
+            return self.base
         start = self._start(selected.groups, selected.coefficients)
         self.refit([start], race=False)
         found = self.models[frozenset(start.effects)]
         if not np.isfinite(found.fit.cost):
-            return best
+            return self.base
         found = self._lean(found)
         if selected.shows_steps:
             found = self._corrected(found)
-        return found if found.merit > best.merit else best
+        return self._better(found, self.base)
 
     def _is_explained(self, model: Model) -> bool:
         """Whether a fitted model leaves no more than noise."""
@@ -421,9 +469,9 @@ class PredictionErrorSearch(Search):
             return best
         starts = []
         for name in best.names:
-            for group, coefficients, behind in self._rivals(best, name):
+            for group, coefficients, _ in self._rivals(best, name):
                 names = tuple(n for n in best.names if n != name) + (group.effect,)
-                if behind > RIVAL or frozenset(names) in self.models:
+                if frozenset(names) in self.models:
                     continue
                 theta = best.fit.theta.copy()
                 theta[self.world.slots[name]] = 0.0
@@ -442,13 +490,14 @@ class PredictionErrorSearch(Search):
         regression = self._regression(model)
         own = self._own[self._key(model)][name]
         rest = regression.instead_of(own)
-        gains = rest.gains([])
-        mine = rest.gain_of(own)
+        # What has more coefficients gains more by chance.
+        gains = rest.gains([]) - np.array([rest.price(group) for group in rest.groups])
+        mine = rest.gain_of(own) - self._price(name)
         found: dict[str, tuple[Group, Array, float]] = {}
         for i in np.argsort(-gains, kind="stable").tolist():
             group = rest.groups[i]
             behind = mine - float(gains[i])
-            if behind > RIVAL or len(found) == MAX_RIVALS:
+            if behind > RIVAL + LINEAR * mine or len(found) == MAX_RIVALS:
                 break
             library = group.effect in self.world.library
             if library and group.effect not in (*model.names, *found):
