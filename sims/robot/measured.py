@@ -132,6 +132,11 @@ class MeasuredLinear(Linear):
         return self._steps + 1
 
     @property
+    def step(self) -> float:
+        """Seconds of a step of the simulator."""
+        return self._motion.step
+
+    @property
     def positions(self) -> int:
         """Number of positions in a state, those of joints in series included."""
         return int(self._motion.x.shape[1])

@@ -89,6 +89,9 @@ class _Arrow:
             # differ by more than double precision holds, and the smaller would be taken for zero.
             scale = np.sqrt(np.maximum(np.diagonal(self.shared)[moves], LEAST_POWER))
             scaled = free / np.outer(scale, scale)
+            if not np.isfinite(scaled).all():
+                # Derivatives of a motion that explodes lead nowhere.
+                return np.full(len(right), np.nan), np.full(self.pull.shape, np.nan)
             # least squares takes the shortest step where parameters act alike
             solution = np.linalg.lstsq(scaled, right[moves] / scale, rcond=None)
             shared[moves] = solution[0] / scale

@@ -20,11 +20,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.gap.causes.candidates import Probe
-from bench.gap.model.differences import followed
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
 from bench.gap.prediction_error.measured_states import measured_states
 from bench.gap.prediction_error.state_estimation import (
+    LARGEST,
     SMALLEST_FORCE,
     Filtered,
     LinearRuns,
@@ -216,6 +216,11 @@ class FollowedRuns:
             losses.append(2.0 * (best - float(found.log_likelihood.sum())))
         return np.array(losses)
 
+    @property
+    def step(self) -> float:
+        """Seconds of a step of the simulator."""
+        return float(self.linear[0].step)
+
     def trajectories(self) -> list[Trajectory]:
         """Return the smoothed motion of each run."""
         size = self.runs.prior.size
@@ -291,7 +296,7 @@ class FollowedRuns:
                 result[:, i, :, : own.size] = self.runs.readings[:, i] @ s
                 if i + 1 < samples:
                     s = self.runs.states[:, i] @ s
-        result[~followed(result)] = 0.0
+        result[~(np.abs(result) < LARGEST)] = 0.0
         return result
 
     def output_sensitivities(self, probes: Sequence[Probe]) -> Array:
@@ -309,7 +314,7 @@ class FollowedRuns:
                 result[:, i] = columns.readings[:, i] + self.runs.readings[:, i] @ s
                 if i + 1 < samples:
                     s = a[:, i] @ s + by[:, i] @ columns.pushed[:, i]
-        result[~followed(result)] = 0.0
+        result[~(np.abs(result) < LARGEST)] = 0.0
         return result[..., columns.places] / columns.sizes
 
     def first_states(self) -> Array:

@@ -62,15 +62,17 @@ MANY_SHAPES = frozenset(
 """Effects that are tried at many shapes, and only where plain ones leave a force missing."""
 NEEDED = 20.0
 """Twice the log likelihood that the process noise of a joint must gain to be needed there."""
-RIVAL = 30.0
+RIVAL = 20.0
 """Rivals this near in twice the log likelihood of the regression are fitted by simulation."""
-LINEAR = 0.015
+LINEAR = 0.007
 """Share of a gain by which it may be wrong, since responses are linear."""
-MAX_RIVALS = 4
+MAX_RIVALS = 3
 """Maximum number of rivals of each effect that are fitted by simulation."""
 MAX_STEPS = 4
 """Maximum number of effects that are added one after another."""
-TRIED = 5
+KEPT = 6
+"""Number of filters that are kept for effects that were tried."""
+TRIED = 4
 """Maximum number of effects that are tried in the model at each step."""
 PROMISING = 0.3
 """Share of the largest gain by regression that an effect must have to be tried in the model."""
@@ -99,6 +101,7 @@ class PredictionErrorSearch(Search):
     _hats: Columns | None = None
     _followed: dict[bytes, FollowedRuns] = field(default_factory=dict)
     _regressions: dict[bytes, Regression] = field(default_factory=dict)
+    _tried: dict[bytes, FollowedRuns] = field(default_factory=dict)
     _own: dict[bytes, dict[str, list[int]]] = field(default_factory=dict)
 
     def run(self) -> Model:
@@ -113,11 +116,11 @@ class PredictionErrorSearch(Search):
         best = self._of_friction(selected)
         if not self._is_explained(best):
             best = self._better(best, self._fitted(selected))
+        if not self._is_explained(best) and not self._is_cut and self._needs_noise(selected):
+            best = self._better(best, self._step_by_step(selected, ()))
         if not self._is_explained(best):
             selected = self._with_many_shapes(selected)
             best = self._better(best, self._fitted(selected))
-        if not self._is_explained(best) and not self._is_cut:
-            best = self._better(best, self._step_by_step(selected, ()))
         if not best.names:
             best = self._confirmed(selected)
         self.supported = best
@@ -200,11 +203,14 @@ class PredictionErrorSearch(Search):
             watch.stage("testing effects in the model one by one", TRIED)
             tried = []
             for name, start in self._promising(followed, theta, names):
-                tried.append((*self._refined(start, [*names, name]), name))
+                tried.append((*self._refined(start, [*names, name], turns=0), name))
                 watch.advance()
                 watch.check()
             if not tried:
                 break
+            # The coefficients of the best two are improved before they are compared.
+            tried.sort(key=lambda one: self._price(one[3]) - 2.0 * one[2])
+            tried = [(*self._refined(one[0], [*names, one[3]]), one[3]) for one in tried[:2]]
             found, own, best, name = max(tried, key=lambda one: 2.0 * one[2] - self._price(one[3]))
             if 2.0 * (best - likelihood) < self._price(name):
                 break
@@ -243,7 +249,8 @@ class PredictionErrorSearch(Search):
             theta[slot] = own
             names = (*(n for n in model.names if n not in members), family)
             self.refit([Start(names, theta, model.fit.states)], race=False)
-            model = self._better(self.models[frozenset(names)], model)
+            fitted = self.models[frozenset(names)]
+            model = fitted if fitted.merit > model.merit - SWITCH else model
         return model
 
     def lacks(self, model: Model) -> float:
@@ -299,21 +306,30 @@ class PredictionErrorSearch(Search):
             found[group.effect] = begun
         return list(found.items())
 
-    def _refined(self, theta: Array, names: Sequence[str]) -> tuple[Array, FollowedRuns, float]:
-        """Improve coefficients by a Gauss-Newton step on the innovations, and follow again."""
+    def _refined(
+        self, theta: Array, names: Sequence[str], turns: int = REFINED
+    ) -> tuple[Array, FollowedRuns, float]:
+        """Follow the runs with effects in the model, and again after Gauss-Newton steps of their
+        coefficients on the innovations.
+        """
+        key = theta.tobytes()
+        known = self._tried.get(key)
         world, motion = self.world, self.follow().trajectories()
         noise = self.follow().noise
         best: tuple[Array, FollowedRuns, float] | None = None
-        for turn in range(REFINED + 1):
+        for turn in range(turns + 1):
             force = self.follow().force if best is None else best[1].force
-            followed = FollowedRuns.follow(world, theta, noise, motion, force=force)
+            followed = known if turn == 0 and known is not None else None
+            if followed is None:
+                followed = FollowedRuns.follow(world, theta, noise, motion, force=force)
             likelihood = float(followed.filtered.log_likelihood.sum())
             if best is not None and likelihood < best[2]:
                 break
             best = theta, followed, likelihood
-            if turn < REFINED:
+            if turn < turns:
                 theta = self._improved(followed, theta, names)
         assert best is not None
+        self._tried = {best[0].tobytes(): best[1], **dict(list(self._tried.items())[:KEPT])}
         return best
 
     def _improved(self, followed: FollowedRuns, theta: Array, names: Sequence[str]) -> Array:
@@ -380,7 +396,9 @@ class PredictionErrorSearch(Search):
         softer = -np.inf if is_soft else self._likelihood(plain, soft_kind(world.kind))
         own = self._likelihood(start.theta, world.kind) if has_state else -np.inf
         best = max(likelihood, softer)
-        names = tuple(n for n in native if has_dry_friction(world, [n]))
+        names = tuple(dict.fromkeys(n for n in native if has_dry_friction(world, [n])))
+        # A family has all its members.
+        names = tuple(n for n in names if not any(n in world.effects[m].contains for m in names))
         stands = best > own - 0.5 * SWITCH
         return names if stands else (), softer > max(likelihood, own) + 0.5 * SWITCH
 
@@ -414,7 +432,9 @@ class PredictionErrorSearch(Search):
         same = known is not None and known.world is self.world
         if known is None or not same or not np.array_equal(known.theta, theta):
             self.world.watch.stage("following the runs with the model", 1)
-            nearby = None if known is None else known.trajectories()
+            # Of other steps the motion is not known at the ends of these.
+            alike = known is not None and known.step == self.world.simulator.step
+            nearby = known.trajectories() if known is not None and alike else None
             known = FollowedRuns.follow(self.world, theta, self.noise, nearby)
             self.world.followed = known
         return known
@@ -427,7 +447,14 @@ class PredictionErrorSearch(Search):
         return self._columns
 
     def _probes(self, names: Sequence[str]) -> list[Probe]:
-        return [p for name in names for p in _first(self.world, self.base.fit, name)]
+        found = []
+        for name in names:
+            lows = [low for low, _ in coefficient_bounds(self.world, name)]
+            for probe in _first(self.world, self.base.fit, name):
+                # What the model file states may be too much.
+                signed = probe.signed or (lows[probe.place] < 0 and not probe.fixed)
+                found.append(replace(probe, signed=signed))
+        return found
 
     @staticmethod
     def _is_rich(name: str) -> bool:
@@ -499,8 +526,10 @@ class PredictionErrorSearch(Search):
             behind = mine - float(gains[i])
             if behind > RIVAL + LINEAR * mine or len(found) == MAX_RIVALS:
                 break
-            library = group.effect in self.world.library
-            if library and group.effect not in (*model.names, *found):
+            if group.effect not in self.world.library or group.effect in (*model.names, *found):
+                continue
+            # A richer law never stands for a plainer one that does as well.
+            if name not in self.world.effects[group.effect].contains:
                 found[group.effect] = group, rest.solve([group])[1][0], behind
         return list(found.values())
 

@@ -44,6 +44,10 @@ AR_FLOOR = 1e-3
 """White part of AR(1) noise, as a share of its variance, so that no reading is exact."""
 LARGEST_CHANGE = 10.0
 """Largest factor by which an iteration of (7) changes a variance."""
+LARGEST = 1e12
+"""Derivatives and defects beyond it are those of a model that explodes, and left out."""
+LARGEST_COVARIANCE = 1e8
+"""Variances of predicted states are limited to it, in SI units squared."""
 SEGMENT = 80
 """Number of samples of a segment on which the process noise is fitted."""
 ITERATIONS = 12
@@ -151,6 +155,9 @@ class LinearRuns:
         recorded = np.isfinite(residuals) & np.isfinite(observed)
         residuals[~recorded] = 0.0
         readings[~recorded] = 0.0
+        # A step from where the model explodes tells nothing of the next one.
+        for values in (states, defects, by_force, inputs, readings, errors):
+            values[~(np.abs(values) < LARGEST)] = 0.0
         return cls(
             states, defects, by_force, inputs, readings, residuals, recorded, prior, errors
         )
@@ -280,7 +287,7 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
         h = runs.readings[:, i]
         predicted[:, i], covariances[:, i] = x, p
         crossed = p @ h.transpose(0, 2, 1)
-        root = np.linalg.cholesky(h @ crossed + noise[:, i])
+        root = np.linalg.cholesky(h @ crossed + noise[:, i])  # positive: R is
         whitener = np.linalg.solve(root, np.broadcast_to(identity, root.shape))
         half = crossed @ whitener.transpose(0, 2, 1)
         gain = half @ whitener
@@ -296,6 +303,11 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
         a = runs.states[:, i]
         x = (a @ x[:, :, None])[:, :, 0] - runs.defects[:, i]
         p = a @ p @ a.transpose(0, 2, 1) + excited[:, i]
+        p = 0.5 * (p + p.transpose(0, 2, 1))
+        # Of a motion that is unstable at this rate nothing is known after the step.
+        lost = ~(np.abs(p).max(axis=(1, 2)) < LARGEST_COVARIANCE)
+        if lost.any():
+            p[lost] = np.diag(np.square(runs.prior) + 1.0)
     return Filtered(predicted, covariances, innovations, gains, whiteners, likelihood)
 
 
