@@ -40,10 +40,14 @@ from sims.robot.scales import floating_forces, scales
 from sims.robot.simulator import RobotSimulator
 from sims.system import Effect
 
-POSITION_PRIOR, VELOCITY_PRIOR = 1.0, 10.0
-"""Standard deviations of the first states about the measured motion, rad or m, and per second."""
-UNMEASURED_PRIOR = 0.3
-"""The same of positions that are not recorded."""
+POSITION_PRIOR, VELOCITY_PRIOR = 20.0, 0.3
+"""Standard deviations of the first states about the measured motion: of positions in units of the
+noise, of velocities as a share of the largest one.
+"""
+LEAST_PRIOR = 1e-4
+"""The smallest ones, rad or m, and per second."""
+UNMEASURED_PRIOR, UNMEASURED_SPEED = 0.3, 3.0
+"""The same of joints that are not recorded, rad or m, and per second."""
 FIRST_FORCE = 0.1
 """Missing force from which the fit of the process noise begins, as a share of a typical force."""
 RELINEARISED = 2
@@ -177,7 +181,7 @@ class FollowedRuns:
         size = maps[0].states.shape[1]
         robot = world.simulator.robot
         typical = np.concatenate([scales(robot).force, floating_forces(robot)])
-        runs = LinearRuns.stacked(maps, world.observed, _prior(world, size))
+        runs = LinearRuns.stacked(maps, world.observed, _prior(world, noise, linear, size))
         begin = FIRST_FORCE * typical if force is None else force
         begun = cls(world, theta, noise, linear, runs, begin, _NONE, _NOTHING, typical)
         return begun.refitted(runs)
@@ -318,11 +322,17 @@ class FollowedRuns:
         return result[..., columns.places] / columns.sizes
 
     def first_states(self) -> Array:
-        """Return smoothed positions and velocities of the joints at the first samples (R, 2 D)."""
+        """Return positions and velocities of the joints at the first samples (R, 2 D): those of the
+        readings alone where they are recorded, since a stiff servo hides the first velocity from a
+        linear model, and smoothed ones of other joints.
+        """
         found = []
-        for linear, trajectory in zip(self.linear, self.trajectories(), strict=True):
-            first = int(linear.knots[0])
-            found.append(np.concatenate([trajectory.x[first], trajectory.v[first]]))
+        for run, trajectory in enumerate(self.trajectories()):
+            first = int(self.linear[run].knots[0])
+            x, v = trajectory.x[first].copy(), trajectory.v[first].copy()
+            for joint, states in measured_states(self.world, self.noise.sigma, run).items():
+                x[joint], v[joint] = states[0, :2]
+            found.append(np.concatenate([x, v]))
         return np.array(found)
 
     def _through_filter(
@@ -390,13 +400,20 @@ def _linearised(
     return MeasuredLinear(robot, theta, scenario, start, given, nearby=nearby)
 
 
-def _prior(world: World, size: int) -> Array:
-    """(Z,) standard deviations of the first states."""
+def _prior(world: World, noise: Noise, linear: Sequence[MeasuredLinear], size: int) -> Array:
+    """(Z,) standard deviations of the first states about the measured motion.
+
+    A stiff servo forgets the first velocity within a sample, so that the readings do not fix it.
+    """
     coordinates = world.simulator.system.coordinates
     prior = np.full(size, 1e-9)
-    joints = len(coordinates)
-    for joint, name in enumerate(coordinates):
-        measured = name in world.channels
-        prior[joint] = POSITION_PRIOR if measured else UNMEASURED_PRIOR
-        prior[joints + joint] = VELOCITY_PRIOR
+    joints, positions = len(coordinates), linear[0].positions
+    speeds = np.max([np.abs(one.trajectory.v).max(axis=0) for one in linear], axis=0)
+    for joint, name in enumerate(coordinates[:joints]):
+        if name in world.channels:
+            sigma = float(noise.sigma[world.channels.index(name)])
+            prior[joint] = max(POSITION_PRIOR * sigma, LEAST_PRIOR)
+            prior[positions + joint] = VELOCITY_PRIOR * speeds[joint] + LEAST_PRIOR
+        else:
+            prior[joint], prior[positions + joint] = UNMEASURED_PRIOR, UNMEASURED_SPEED
     return prior

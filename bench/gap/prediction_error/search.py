@@ -35,6 +35,7 @@ from bench.gap.friction_form import (
 from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.models import Model
 from bench.gap.model.problem import Fit, Known, Start
+from bench.gap.model.tangents import begun
 from bench.gap.model.world import World
 from bench.gap.prediction_error.candidate_responses import Columns, FollowedRuns
 from bench.gap.prediction_error.identification import Selected, identify, regress
@@ -43,6 +44,7 @@ from bench.gap.prediction_error.selection import Regression
 from sims.base import Array
 from sims.robot.forces import OVER_TIME
 from sims.robot.native import FIELDS
+from sims.robot.scales import scales
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
 from sims.simulated import Simulated
@@ -70,6 +72,10 @@ MAX_RIVALS = 3
 """Maximum number of rivals of each effect that are fitted by simulation."""
 MAX_STEPS = 4
 """Maximum number of effects that are added one after another."""
+SOME = 0.1
+"""Share of the stated dry friction that is taken away where less of it is tried."""
+FEW = 2
+"""Sets of at most so many effects are fitted by simulation even where that is slow."""
 KEPT = 6
 """Number of filters that are kept for effects that were tried."""
 TRIED = 4
@@ -142,10 +148,16 @@ class PredictionErrorSearch(Search):
         plain, softer = self._form_of_friction(selected)
         if not plain:
             return self.base
-        best = self._step_by_step(selected, plain)
-        if softer and not self._is_explained(best) and self._is_softer(best):
+        start = self._start(selected.groups, selected.coefficients)
+        only, own = self.base.fit.theta.copy(), self._plain_theta(start)
+        for name in plain:
+            only[self.world.slots[name]] = own[self.world.slots[name]]
+        best = self._fit(Start(plain, only, self._first_states))
+        if self._is_explained(best):
+            return self._lean(best)
+        if softer and self._is_softer(best):
             raise SoftFrictionError
-        return best
+        return self._step_by_step(selected, plain)
 
     def _needs_noise(self, selected: Selected) -> bool:
         """Whether forces are still missing beside what was selected."""
@@ -155,7 +167,8 @@ class PredictionErrorSearch(Search):
         """The selected set fitted by simulation, where that is quick or promises to end the search;
         else the base model.
         """
-        if self._is_slow(selected) and self._needs_noise(selected):
+        large = len(selected.groups) > FEW
+        if large and self._is_slow(selected) and self._needs_noise(selected):
             return self.base
         return self._confirmed(selected)
 
@@ -178,6 +191,13 @@ class PredictionErrorSearch(Search):
         return any(m.of not in FIELDS for e in effects for m in _members(e) if _is_force(m))
 
     # -- selection with the model linearised again after each effect
+
+    @property
+    def _first_states(self) -> Array:
+        """(R, s) smoothed states at the first samples: those of the base fit are bent by what is
+        missing.
+        """
+        return self.world.guess
 
     def _step_by_step(self, selected: Selected, begin: Sequence[str]) -> Model:
         """Add effects one after another, each chosen by whole filters with the effect in the model.
@@ -221,8 +241,7 @@ class PredictionErrorSearch(Search):
                 break
         if not names:
             return self.base
-        self.refit([Start(tuple(names), theta, self.base.fit.states)], race=False)
-        fitted = self.models[frozenset(names)]
+        fitted = self._fit(Start(tuple(names), theta, self._first_states))
         return self._lean(fitted) if np.isfinite(fitted.fit.cost) else self.base
 
     def _lean(self, model: Model) -> Model:
@@ -297,14 +316,41 @@ class PredictionErrorSearch(Search):
                 continue
             if len(found) == TRIED or gains[i] < max(PROMISING * gains.max(), 0.0):
                 break
-            begun = theta.copy()
+            start = theta.copy()
             for contained in self.world.effects[group.effect].contains:
-                begun[self.world.slots[contained]] = 0.0
-            begun[self.world.slots[group.effect]] = self._numbers(
+                start[self.world.slots[contained]] = 0.0
+            start[self.world.slots[group.effect]] = self._numbers(
                 group, regression.solve([group])[1][0]
             )
-            found[group.effect] = begun
-        return list(found.items())
+            found[group.effect] = start
+        return [*found.items(), *self._of_joint_model(followed, theta, [*names, *found])]
+
+    def _of_joint_model(
+        self, followed: FollowedRuns, theta: Array, names: Sequence[str]
+    ) -> list[tuple[str, Array]]:
+        """The standard joint model at the joint where most is missing: dry friction, without what
+        the model file states of it, and armature, as large as the joint's own inertia.
+
+        Neither is linear where a joint sticks, or where a servo is too stiff for a light joint.
+        """
+        world = self.world
+        assert isinstance(world.simulator, RobotSimulator)
+        coordinates = world.simulator.system.coordinates
+        joint = int(np.argmax(followed.needs_process_noise()[: len(coordinates)]))
+        place = coordinates[joint].removeprefix("q.")
+        inertia = float(scales(world.simulator.robot).inertia[joint])
+        found = []
+        for effect in ("friction.coulomb", "inertia.armature"):
+            name = f"{effect}@{place}"
+            if name not in world.library or name in names:
+                continue
+            low, high = coefficient_bounds(world, name)[0]
+            value = inertia if effect == "inertia.armature" else SOME * low
+            if value:
+                start = theta.copy()
+                start[world.slots[name]] = np.clip(value, low, high)
+                found.append((name, start))
+        return found
 
     def _refined(
         self, theta: Array, names: Sequence[str], turns: int = REFINED
@@ -477,14 +523,25 @@ class PredictionErrorSearch(Search):
         if not selected.groups:
             return self.base
         start = self._start(selected.groups, selected.coefficients)
-        self.refit([start], race=False)
-        found = self.models[frozenset(start.effects)]
+        found = self._fit(start)
         if not np.isfinite(found.fit.cost):
             return self.base
         found = self._lean(found)
         if selected.shows_steps:
             found = self._corrected(found)
         return self._better(found, self.base)
+
+    def _fit(self, start: Start) -> Model:
+        """Fit a set by simulation; where that leaves much, again with derivatives by the first
+        states about the simulated motion, since those about the measured one may not hold.
+        """
+        self.refit([start], race=False)
+        found = self.models[frozenset(start.effects)]
+        if self._is_explained(found) or not np.isfinite(found.fit.cost):
+            return found
+        begun(self.world, found.fit.theta, found.fit.states, anew=True)
+        self.refit([found.fit.start()], race=False)
+        return self.models[frozenset(start.effects)]
 
     def _is_explained(self, model: Model) -> bool:
         """Whether a fitted model leaves no more than noise."""
@@ -540,11 +597,11 @@ class PredictionErrorSearch(Search):
         self, groups: Sequence[Group], coefficients: Sequence[Array], fit: Fit | None = None
     ) -> Start:
         """Where the fit of a set by simulation begins."""
-        fit = fit or self.base.fit
+        states = self._first_states if fit is None else fit.states
         theta = self.base.fit.theta.copy()
         for group, own in zip(groups, coefficients, strict=True):
             theta[self.world.slots[group.effect]] = self._numbers(group, own)
-        return Start(self._names(groups), theta, fit.states)
+        return Start(self._names(groups), theta, states)
 
     def _numbers(self, group: Group, coefficients: Array) -> Array:
         """The coefficients of an effect that a group of columns with these coefficients means."""
