@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 
 from bench.gap.assess import Assessor
-from bench.gap.causes.name import Finding, name
+from bench.gap.causes.name import Finding, answer, name
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import probes, remains
 from bench.gap.cross_validation import CrossValidation
@@ -352,7 +352,7 @@ class _Explainer:
         return Explanation(verdict, story, self._extended(search, finding))
 
     def _searched(self, base: Base) -> _Found:
-        """Search and judge; again with MuJoCo's soft form of dry friction where the data show it."""
+        """Search and judge; again with MuJoCo's soft dry friction where the data show it."""
         # One stream for surrogates and bootstrap: the same seed tells the same story.
         rng = self._rng()
         search = self._search(base, rng)
@@ -386,11 +386,22 @@ class _Explainer:
         """
         base = search.base
         if not self.faults:
-            finding = self.assessor.judged(search, name(search, self.validation))
+            finding = self.assessor.judged(search, self._named(search))
             self.faults = self._imitated(search, finding) or self._unexplained(search, finding)
             if not self.faults:
                 return finding
         return Finding("unknown", base, base, (), remains(search, base))
+
+    def _named(self, search: Search) -> Finding:
+        """Answer the questions about a recording; about a robot's by prediction errors."""
+        if not self.kind.has_model:
+            return name(search, self.validation)
+        # Loaded where there is a robot alone.
+        from bench.gap.prediction_error.confirmation import Confirmation
+        from bench.gap.prediction_error.search import PredictionErrorSearch
+
+        assert isinstance(search, PredictionErrorSearch)
+        return answer(Confirmation(search, self.validation))
 
     def _unexplained(self, search: Search, finding: Finding) -> tuple[RecordingFault, ...]:
         """Wrong units and signs of a robot's recording that no effect explains."""
@@ -494,12 +505,11 @@ class _Explainer:
         if self.watch.left() or not np.isfinite(base.fit.cost):
             return True
         # Loaded where there is a robot alone.
-        from bench.gap.prediction_error.identification import needs_correction
         from bench.gap.prediction_error.search import PredictionErrorSearch
 
         search = self._search(base, self._rng())
         assert isinstance(search, PredictionErrorSearch)
-        return needs_correction(search.follow())
+        return search.follow().shows_step_errors()
 
     def _settled(self, base: Base) -> Base:
         """The base model of a robot whose step is chosen."""

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sims.base import Array
 from sims.extended import Number
-from sims.robot.model import Robot
+
+if TYPE_CHECKING:
+    from sims.robot.model import Robot
 
 FAMILY = "*"
 """The place of a family."""

@@ -27,6 +27,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sims.base import Array, Scenario
 from sims.robot.floating import Afloat
@@ -39,6 +40,8 @@ from sims.robot.series import is_series
 from sims.robot.tangent import Change
 from sims.simulated import Simulated
 from sims.system import Acting, Input, Sensor
+
+SingleArray = NDArray[np.float32]
 
 BLOCK = 64
 """Number of candidates whose responses are computed together."""
@@ -158,7 +161,7 @@ class MeasuredLinear(Linear):
     def _from_samples(self, motion: Motion) -> Trajectory:
         """Interpolate the measured joints between samples by quintic Hermite polynomials."""
         x, v = motion.x.copy(), motion.v.copy()
-        steps = self._simulator.step * np.arange(len(x))
+        steps: Array = self._simulator.step * np.arange(float(len(x)))
         for joint, samples in self._measured.items():
             x[:, joint], v[:, joint] = quintic(self._times, samples, steps)
         own = len(self._simulator.addresses.positions)
@@ -209,9 +212,7 @@ class MeasuredLinear(Linear):
         with np.errstate(all="ignore"), quiet():
             seen = self._seen(moved, read, [()] * size)
         readings = np.moveaxis((seen - self.observed) / SMALL, 0, 2)
-        return IntervalMaps(
-            states, defect, force, self._composed, readings, self.observed, missed
-        )
+        return IntervalMaps(states, defect, force, self._composed, readings, self.observed, missed)
 
     def _step_errors(self) -> Array:
         """(N, Z) what a step misses; nothing for Runge-Kutta, which is of fourth order."""
@@ -232,7 +233,7 @@ class MeasuredLinear(Linear):
             result.append((self.knots[:-1][active] + number, active))
         return result
 
-    def added(self, effects: Sequence[Added]) -> tuple[Array, Array]:
+    def added(self, effects: Sequence[Added]) -> tuple[SingleArray, SingleArray]:
         """Compute what candidate effects add to (3) and (4).
 
         A force is taken for its mean over the interval between two samples.

@@ -14,17 +14,12 @@ import numpy as np
 
 from sims.base import InputError, unknown
 from sims.robot.collision_hulls import CollisionShapes
+from sims.robot.friction_form import FrictionForm
 from sims.robot.quiet import quiet
 
 Format = Literal["mjcf", "urdf"]
 Kind = Literal["hinge", "slide", "ball", "free"]
 Drive = Literal["motor", "position", "velocity", "pid", "other"]
-FrictionForm = Literal["stiff", "soft"]
-"""How MuJoCo's solver holds the dry friction that effects add: ``stiff`` is Coulomb friction, as
-stiff as the integrator allows; ``soft`` leaves the solver parameters of the model file
-(`solreffriction`, `solimpfriction`, MuJoCo's defaults where the file states none).
-"""
-FRICTION_FORMS: tuple[FrictionForm, ...] = ("stiff", "soft")
 KINDS: tuple[Kind, ...] = ("free", "ball", "slide", "hinge")
 """In the order of MuJoCo's mjtJoint."""
 

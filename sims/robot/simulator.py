@@ -25,9 +25,10 @@ from sims.robot.felt import INSTANT, SHARE
 from sims.robot.felt import felt as felt_over
 from sims.robot.floating import Afloat, Floating
 from sims.robot.forces import Forces, over_time
+from sims.robot.friction_form import FrictionForm
 from sims.robot.lanes import LANES, Addresses, Bench
 from sims.robot.midway import Mask, Places
-from sims.robot.model import FrictionForm, Robot
+from sims.robot.model import Robot
 from sims.robot.numerics import INTEGRATORS, Numerics, RobotEngine, own_numerics
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled

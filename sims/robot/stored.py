@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sims.base import InputError
-from sims.robot.model import FRICTION_FORMS, FrictionForm
+from sims.robot.friction_form import FRICTION_FORMS, FrictionForm
 from sims.user_toml import Source, fault, finite, names, table, text
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class StoredRobot:
         actuators: that a recording added, by name.
         engine: time step and integrator that it stated in place of the file's.
         numerics: ``timestep`` and ``integrator`` other than those, of what was found.
-        friction_form: form of the dry friction that effects add (`sims.robot.model.FrictionForm`).
+        friction_form: form of the dry friction that effects add (`sims.robot.friction_form`).
     """
 
     path: Path

@@ -200,7 +200,7 @@ class Tangent:
             count: n.
         """
         q = self.quotients
-        size, joints = q.forces.shape[1:]
+        size = q.forces.shape[1]
         steps = self._steps
         pushed, read = self.pushed(changes, count)
         # States, forces and controls below each other, so that a step is one product.

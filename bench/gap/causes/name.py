@@ -60,26 +60,17 @@ def name(search: Search, held_out: Validation | None) -> Finding:
 
     Args:
         search: with the base model entered.
-        held_out: predicts held-out runs, or each run by cross-validation; None if there are
-            neither.
+        held_out: the runs for measuring; None if there are none.
     """
-    inquiry = _inquiry(search, held_out)
+    return answer(Inquiry(search, held_out))
+
+
+def answer(inquiry: Inquiry) -> Finding:
+    """Answer all questions, or those for which there is time."""
     try:
         return inquiry.answered()
     except EndedError:
         return inquiry.so_far()
-
-
-def _inquiry(search: Search, held_out: Validation | None) -> Inquiry:
-    """Questions about a robot are asked by prediction errors."""
-    if not search.world.linear:
-        return Inquiry(search, held_out)
-    # Loaded where there is a robot alone.
-    from bench.gap.prediction_error.confirmation import Confirmation
-    from bench.gap.prediction_error.search import PredictionErrorSearch
-
-    assert isinstance(search, PredictionErrorSearch)
-    return Confirmation(search, held_out)
 
 
 class Inquiry:
@@ -211,6 +202,7 @@ def shows_nothing(search: Search) -> bool:
 
 
 def without_motion(search: Search) -> Finding:
+    """Return the finding about a recording in which nothing moves."""
     base, world = search.base, search.world
     # Nothing can be known of any of them, and no test of what is left would mean anything.
     vague = tuple(world.parameters[i].name for i in world.base)

@@ -110,9 +110,8 @@ def without_step(world: World, noise: Noise, base: Base) -> Base:
     """The base model of a robot, without what the engine's own step leaves of it."""
     # loaded where there is a robot alone
     from bench.gap.model.tangents import correct
-    from bench.gap.prediction_error.identification import needs_correction
 
-    if world.followed is not None and not needs_correction(world.followed):
+    if world.followed is not None and not world.followed.shows_step_errors():
         return base
     correct(world, noise, base.fit.theta, base.fit.states)
     if world.correction is None:

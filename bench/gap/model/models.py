@@ -148,7 +148,7 @@ class Models:
         """Return a start with the derivatives that are known near it."""
         return start
 
-    def force_of_any_shape(self, model: Model) -> tuple[float, str] | None:
+    def force_of_any_shape(self, model: Model) -> tuple[float, str] | None:  # noqa: ARG002
         """Return the p-value of the best force of any shape, and what it follows; None where that
         is asked by simulation.
         """

@@ -35,7 +35,7 @@ from bench.gap.prediction_error.state_estimation import (
     with_coloured_noise,
 )
 from sims.base import Array
-from sims.robot.measured import IntervalMaps, MeasuredLinear, Trajectory
+from sims.robot.measured import IntervalMaps, MeasuredLinear, SingleArray, Trajectory
 from sims.robot.scales import floating_forces, scales
 from sims.robot.simulator import RobotSimulator
 from sims.system import Effect
@@ -46,6 +46,8 @@ noise, of velocities as a share of the largest one.
 """
 LEAST_PRIOR = 1e-4
 """The smallest ones, rad or m, and per second."""
+LARGEST_PRIOR = 1e3
+"""The largest one of a velocity, rad/s or m/s."""
 UNMEASURED_PRIOR, UNMEASURED_SPEED = 0.3, 3.0
 """The same of joints that are not recorded, rad or m, and per second."""
 FIRST_FORCE = 0.1
@@ -57,6 +59,8 @@ CORRELATIONS = (0.4, 0.6, 0.75, 0.85, 0.92, 0.96)
 """Correlations of AR(1) sensor noise that are tried one after another while they gain."""
 COLOURED = 5.0
 """Log likelihood that a larger correlation must gain."""
+SHOWN = 7.0
+"""Twice the log likelihood that the errors of the integrator's steps must gain."""
 SIDE_BY_SIDE = 256
 """Number of columns that go through the filter together, so that they stay in the cache."""
 
@@ -76,8 +80,8 @@ class Columns:
     probes: tuple[Probe, ...]
     places: Places
     sizes: Array
-    pushed: Array
-    readings: Array
+    pushed: SingleArray
+    readings: SingleArray
 
     def joined(self, others: Columns) -> Columns:
         """Return these candidates with others behind them."""
@@ -153,10 +157,16 @@ class FollowedRuns:
         linear: list[MeasuredLinear] = []
         for _ in range(again):
             # Jacobians change little from one motion to another near the data.
-            nearby = linear or [None] * len(world.tracks)
+            nearby: Sequence[MeasuredLinear | None] = linear or [None] * len(world.tracks)
             linear = [
                 _linearised(
-                    world, theta, noise, run, trajectories and trajectories[run], near, simulator
+                    world,
+                    theta,
+                    noise,
+                    run,
+                    None if trajectories is None else trajectories[run],
+                    near,
+                    simulator,
                 )
                 for run, near in enumerate(nearby)
             ]
@@ -270,19 +280,33 @@ class FollowedRuns:
         sizes = np.array([1.0 if p.fixed else p.c[p.place] for p in probes])
         return Columns(tuple(probes), np.array(places, dtype=np.intp), sizes, pushed, readings)
 
+    def shows_step_errors(self) -> bool:
+        """Whether the innovations show the errors of the integrator's steps, as they do where the
+        recorded motion is that of continuous time, and not where the engine itself made it.
+        """
+        response = self.step_error_response().astype(np.float64)
+        power = float(np.square(response).sum())
+        if not power > 0:
+            return False
+        share = float((response * self.filtered.whitened).sum()) / power
+        return share > 0.5 and share * share * power > SHOWN
+
     def step_error_response(self) -> Array:
         """Return the whitened response (R, T, C) to the errors of the integrator's steps."""
         missed = self.runs.step_errors[..., None].astype(np.float32)
         nothing = np.zeros((*self.runs.residuals.shape, 1), dtype=np.float32)
-        return self._through_filter(missed, nothing)[..., 0]
+        response: Array = self._through_filter(missed, nothing)[..., 0].astype(np.float64)
+        return response
 
-    def responses(self, columns: Columns) -> Array:
+    def responses(self, columns: Columns) -> SingleArray:
         """Carry columns through the filter by (1): whitened responses (R, T, C, K), in units of
         the probes' coefficients.
         """
         inputs = self.runs.inputs.astype(np.float32)
         found = self._through_filter(columns.pushed, columns.readings, inputs)
-        return found[..., columns.places] / columns.sizes.astype(np.float32)
+        sizes: SingleArray = columns.sizes.astype(np.float32)
+        result: SingleArray = found[..., columns.places] / sizes
+        return result
 
     def state_sensitivities(self) -> Array:
         """Return the derivatives (R, T, C, 2 D) of the readings by the first positions and
@@ -336,8 +360,8 @@ class FollowedRuns:
         return np.array(found)
 
     def _through_filter(
-        self, pushed: Array, readings: Array, inputs: Array | None = None
-    ) -> Array:
+        self, pushed: SingleArray, readings: SingleArray, inputs: SingleArray | None = None
+    ) -> SingleArray:
         """Carry columns through (1).
 
         Args:
@@ -413,7 +437,8 @@ def _prior(world: World, noise: Noise, linear: Sequence[MeasuredLinear], size: i
         if name in world.channels:
             sigma = float(noise.sigma[world.channels.index(name)])
             prior[joint] = max(POSITION_PRIOR * sigma, LEAST_PRIOR)
-            prior[positions + joint] = VELOCITY_PRIOR * speeds[joint] + LEAST_PRIOR
+            speed = VELOCITY_PRIOR * float(speeds[joint]) + LEAST_PRIOR
+            prior[positions + joint] = min(speed, LARGEST_PRIOR)
         else:
             prior[joint], prior[positions + joint] = UNMEASURED_PRIOR, UNMEASURED_SPEED
     return prior

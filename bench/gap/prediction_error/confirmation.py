@@ -1,10 +1,10 @@
 """Confirm by simulation what prediction errors select, and judge it.
 
-    1. The selected set, fitted to whole simulated runs, and its rivals.
-    2. Held-out runs: an effect that makes them worse is removed.
-    3. Is a force of any shape left (`bench.gap.causes.structure`)?
-    4. Which other effects explain the same as well?
-    5. The verdict, by the rules of `bench.gap.causes.rules`.
+1. The selected set, fitted to whole simulated runs, and its rivals.
+2. Held-out runs: an effect that makes them worse is removed.
+3. Is a force of any shape left (`bench.gap.causes.structure`)?
+4. Which other effects explain the same as well?
+5. The verdict, by the rules of `bench.gap.causes.rules`.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ NEAR = 15.0
 class _RobotAlternatives(Alternatives):
     """Collects alternatives of a robot's effects; p-values by the chi squared distribution."""
 
-    def _p_value(self, rest: Model, effect: str, gain: float) -> float:
+    def _p_value(self, rest: Model, effect: str, gain: float) -> float:  # noqa: ARG002
         slot = self.search.world.slots[effect]
         candidates = len(self.search.world.library)
         return float(min(candidates * chdtrc(slot.stop - slot.start, max(gain, 0.0)), 1.0))

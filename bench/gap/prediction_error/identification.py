@@ -24,8 +24,6 @@ from sims.base import Array
 
 PASSES = 4
 """Maximum number of regressions, each with the process noise that the last selection leaves."""
-SHOWN = 7.0
-"""Twice the log likelihood that the errors of the integrator's steps must gain."""
 MOST = 8
 """Maximum number of effects in a set."""
 
@@ -58,18 +56,6 @@ class Selected:
         return [group.effect for group in self.groups]
 
 
-def needs_correction(followed: FollowedRuns) -> bool:
-    """Whether the innovations show the errors of the integrator's steps, as they do where the
-    recorded motion is that of continuous time, and not where the engine itself made it.
-    """
-    response = followed.step_error_response().astype(np.float64)
-    power = float(np.square(response).sum())
-    if not power > 0:
-        return False
-    share = float((response * followed.filtered.whitened).sum()) / power
-    return share > 0.5 and share * share * power > SHOWN
-
-
 def identify(followed: FollowedRuns, columns: Columns, most: int = MOST) -> Selected:
     """Select effects, with the process noise fitted again after each selection.
 
@@ -93,7 +79,13 @@ def identify(followed: FollowedRuns, columns: Columns, most: int = MOST) -> Sele
         done = result is not None and likelihood < result.log_likelihood + 1.0
         if result is None or likelihood > result.log_likelihood:
             result = Selected(
-                selected, found, regression, likelihood, now, numerics, regression.shows_nuisance(selected)
+                selected,
+                found,
+                regression,
+                likelihood,
+                now,
+                numerics,
+                regression.shows_nuisance(selected),
             )
         if done:
             break

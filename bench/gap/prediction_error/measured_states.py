@@ -78,7 +78,9 @@ def _tracked(times: Array, readings: list[tuple[Array, Array]]) -> list[Array]:
     reading[..., 0, 0] = 1.0 / scale[..., 0]
     reading[..., 1, 1] = 1.0 / scale[..., 1]
     reading[~recorded] = 0.0
-    sizes = np.array([max(float(np.nanmax(v[:, 0]) - np.nanmin(v[:, 0])), n[0]) for v, n in readings])
+    sizes = np.array(
+        [max(float(np.nanmax(v[:, 0]) - np.nanmin(v[:, 0])), n[0]) for v, n in readings]
+    )
     # A range over the second, or over the time that the run takes where that is less.
     span = min(float(times[-1] - times[0]), 1.0)
     prior = np.array([10.0, 10.0 / span, 100.0 / span**2]) * max(float(sizes.max()), 1e-9)

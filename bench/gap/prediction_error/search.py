@@ -12,7 +12,7 @@ and its rivals are fitted to whole simulated runs (output errors), which decide.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -231,10 +231,11 @@ class PredictionErrorSearch(Search):
             # The coefficients of the best two are improved before they are compared.
             tried.sort(key=lambda one: self._price(one[3]) - 2.0 * one[2])
             tried = [(*self._refined(one[0], [*names, one[3]]), one[3]) for one in tried[:2]]
-            found, own, best, name = max(tried, key=lambda one: 2.0 * one[2] - self._price(one[3]))
-            if 2.0 * (best - likelihood) < self._price(name):
+            best = max(tried, key=lambda one: 2.0 * one[2] - self._price(one[3]))
+            name = best[3]
+            if 2.0 * (best[2] - likelihood) < self._price(name):
                 break
-            theta, followed, likelihood = found, own, best
+            theta, followed, likelihood, _ = best
             contained = self.world.effects[name].contains
             names = [n for n in names if n not in contained] + [name]
             if not (followed.needs_process_noise() > NEEDED).any():
@@ -451,7 +452,7 @@ class PredictionErrorSearch(Search):
     def _likelihood(self, theta: Array, kind: type[Simulated]) -> float:
         """The log likelihood of the innovations with a simulator and its parameters."""
         world, followed = self.world, self.follow()
-        effects = [*world.library, *world.extra]
+        effects: list[str | type[Effect]] = [*world.library, *world.extra]
         simulator = kind(world.recording.constants, world.channels, effects=effects)
         assert isinstance(simulator, RobotSimulator)
         motion = followed.trajectories()
@@ -474,12 +475,14 @@ class PredictionErrorSearch(Search):
 
     def follow(self) -> FollowedRuns:
         """Return the runs as the filter follows them with the base model."""
-        theta, known = self.base.fit.theta, self.world.followed
+        known: FollowedRuns | None = self.world.followed
+        theta, simulator = self.base.fit.theta, self.world.simulator
+        assert isinstance(simulator, RobotSimulator)
         same = known is not None and known.world is self.world
         if known is None or not same or not np.array_equal(known.theta, theta):
             self.world.watch.stage("following the runs with the model", 1)
             # Of other steps the motion is not known at the ends of these.
-            alike = known is not None and known.step == self.world.simulator.step
+            alike = known is not None and known.step == simulator.step
             nearby = known.trajectories() if known is not None and alike else None
             known = FollowedRuns.follow(self.world, theta, self.noise, nearby)
             self.world.followed = known
@@ -506,13 +509,14 @@ class PredictionErrorSearch(Search):
     def _is_rich(name: str) -> bool:
         return name.partition("@")[0] in MANY_SHAPES
 
-    def _acts_at(self, name: str, joints: Iterable[int]) -> bool:
+    def _acts_at(self, name: str, joints: Collection[int | None]) -> bool:
         """Whether an effect acts at one of some joints."""
         effect, coordinates = self.world.effects[name], self.world.simulator.system.coordinates
         for member in _members(effect):
             if member.coordinate in joints:
                 return True
-            if any(member.signal.partition(".")[2] == coordinates[j][2:] for j in joints):
+            signal = member.signal.partition(".")[2]
+            if any(j is not None and signal == coordinates[j][2:] for j in joints):
                 return True
         return False
 
@@ -554,7 +558,7 @@ class PredictionErrorSearch(Search):
         starts = []
         for name in best.names:
             for group, coefficients, _ in self._rivals(best, name):
-                names = tuple(n for n in best.names if n != name) + (group.effect,)
+                names = (*(n for n in best.names if n != name), group.effect)
                 if frozenset(names) in self.models:
                     continue
                 theta = best.fit.theta.copy()
@@ -679,7 +683,7 @@ class PredictionErrorSearch(Search):
             probes.append(Probe(name, 1 + place, place, moved, signed=True, fixed=True))
         return probes
 
-    def scan(self, model: Model, against: Array | None = None) -> Scores:
+    def scan(self, model: Model, against: Array | None = None) -> Scores:  # noqa: ARG002
         """Score every effect that the model lacks by the innovations."""
         key = frozenset(model.names)
         if key not in self.scored:

@@ -12,7 +12,8 @@ the model is linear (`sims.robot.measured`, eqs. (3) and (4)), and r[i] = y[i] -
 smoother is that of Bryson and Frazier in its modified form (G. J. Bierman, Automatica 9, 503, 1973,
 doi:10.1016/0005-1098(73)90076-9): backward, with C_i = I - K_i H_i,
 
-    λ_i = C_iᵀ A_iᵀ λ_{i+1} - H_iᵀ S_i⁻¹ e_i,   Λ_i = C_iᵀ A_iᵀ Λ_{i+1} A_i C_i + H_iᵀ S_i⁻¹ H_i  (5)
+    λ_i = C_iᵀ A_iᵀ λ_{i+1} - H_iᵀ S_i⁻¹ e_i
+    Λ_i = C_iᵀ A_iᵀ Λ_{i+1} A_i C_i + H_iᵀ S_i⁻¹ H_i                                            (5)
     δ[i|T] = δ-[i] - P-[i] λ_i,                 f[i|T] = - Q G_iᵀ λ_{i+1}                        (6)
 
 The likelihood is stationary in the variance q_j of the force that is missing at coordinate j where
@@ -29,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,30 +105,28 @@ class LinearRuns:
         number, samples, _ = self.residuals.shape
         count = -(-samples // length)
 
-        def cut(values: Array, last: bool) -> Array:
+        def cut(values: Any, last: bool) -> Any:
             shape = (number, count * length, *values.shape[2:])
             padded = np.zeros(shape, dtype=values.dtype)
             padded[:, : values.shape[1]] = values
             parts = padded.reshape(number * count, length, *values.shape[2:])
             return parts if last else parts[:, :-1]
 
-        recorded: Mask = cut(self.recorded, True)
+        recorded: Mask = cut(self.recorded, last=True)
         return LinearRuns(
-            cut(self.states, False),
-            cut(self.defects, False),
-            cut(self.forces, False),
-            cut(self.inputs, False),
-            cut(self.readings, True),
-            cut(self.residuals, True),
+            cut(self.states, last=False),
+            cut(self.defects, last=False),
+            cut(self.forces, last=False),
+            cut(self.inputs, last=False),
+            cut(self.readings, last=True),
+            cut(self.residuals, last=True),
             recorded,
             self.prior,
-            cut(self.step_errors, False),
+            cut(self.step_errors, last=False),
         )
 
     @classmethod
-    def stacked(
-        cls, maps: Sequence[IntervalMaps], observed: Array, prior: Array
-    ) -> LinearRuns:
+    def stacked(cls, maps: Sequence[IntervalMaps], observed: Array, prior: Array) -> LinearRuns:
         """Stack the linear models of runs.
 
         Args:
@@ -158,9 +158,7 @@ class LinearRuns:
         # A step from where the model explodes tells nothing of the next one.
         for values in (states, defects, by_force, inputs, readings, errors):
             values[~(np.abs(values) < LARGEST)] = 0.0
-        return cls(
-            states, defects, by_force, inputs, readings, residuals, recorded, prior, errors
-        )
+        return cls(states, defects, by_force, inputs, readings, residuals, recorded, prior, errors)
 
 
 @dataclass(frozen=True)
@@ -197,7 +195,8 @@ class Filtered:
     @property
     def whitened(self) -> Array:
         """W e (B, T, C): white with unit variance if the model is right."""
-        return np.einsum("btcd,btd->btc", self.whiteners, self.innovations)
+        whitened: Array = np.einsum("btcd,btd->btc", self.whiteners, self.innovations)
+        return whitened
 
 
 @dataclass(frozen=True)
@@ -244,9 +243,7 @@ def with_coloured_noise(runs: LinearRuns, noise: Noise) -> tuple[LinearRuns, Arr
     forces[:, :, :size, : runs.forces.shape[3]] = runs.forces
     sizes = noise.sigma[coloured] * np.sqrt(1.0 - np.square(noise.phi[coloured]))
     forces[:, :, own, runs.forces.shape[3] + np.arange(more)] = sizes
-    readings = np.concatenate(
-        [runs.readings, np.zeros((number, samples, channels, more))], axis=3
-    )
+    readings = np.concatenate([runs.readings, np.zeros((number, samples, channels, more))], axis=3)
     readings[:, :, coloured, own] = 1.0
     readings[~runs.recorded] = 0.0
     prior = np.concatenate([runs.prior, noise.sigma[coloured]])
@@ -267,8 +264,9 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     """
     number, samples, channels = runs.residuals.shape
     size = runs.prior.size
-    scaled = runs.forces * _completed(force, runs)[..., None, None, :]
-    excited = scaled @ scaled.transpose(0, 1, 3, 2)
+    with np.errstate(all="ignore"):
+        scaled = runs.forces * _completed(force, runs)[..., None, None, :]
+        excited = scaled @ scaled.transpose(0, 1, 3, 2)
     # What is not recorded has a reading of zero with the variance of one.
     variances = np.where(runs.recorded, white, 1.0)
     noise = np.zeros((number, samples, channels, channels))
@@ -283,31 +281,34 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     whiteners = np.zeros((number, samples, channels, channels))
     likelihood = np.zeros(number)
     identity = np.eye(channels)
-    for i in range(samples):
-        h = runs.readings[:, i]
-        predicted[:, i], covariances[:, i] = x, p
-        crossed = p @ h.transpose(0, 2, 1)
-        root = np.linalg.cholesky(h @ crossed + noise[:, i])  # positive: R is
-        whitener = np.linalg.solve(root, np.broadcast_to(identity, root.shape))
-        half = crossed @ whitener.transpose(0, 2, 1)
-        gain = half @ whitener
-        e = runs.residuals[:, i] - (h @ x[:, :, None])[:, :, 0]
-        w = (whitener @ e[:, :, None])[:, :, 0]
-        likelihood -= np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        likelihood -= 0.5 * np.square(w).sum(axis=1)
-        innovations[:, i], gains[:, i], whiteners[:, i] = e, gain, whitener
-        if i + 1 == samples:
-            break
-        x = x + (half @ w[:, :, None])[:, :, 0]
-        p = p - half @ half.transpose(0, 2, 1)
-        a = runs.states[:, i]
-        x = (a @ x[:, :, None])[:, :, 0] - runs.defects[:, i]
-        p = a @ p @ a.transpose(0, 2, 1) + excited[:, i]
-        p = 0.5 * (p + p.transpose(0, 2, 1))
-        # Of a motion that is unstable at this rate nothing is known after the step.
-        lost = ~(np.abs(p).max(axis=(1, 2)) < LARGEST_COVARIANCE)
-        if lost.any():
-            p[lost] = np.diag(np.square(runs.prior) + 1.0)
+    # Of a model that explodes nothing is known, and its likelihood is zero.
+    with np.errstate(all="ignore"):
+        for i in range(samples):
+            h = runs.readings[:, i]
+            predicted[:, i], covariances[:, i] = x, p
+            crossed = p @ h.transpose(0, 2, 1)
+            root = np.linalg.cholesky(h @ crossed + noise[:, i])
+            whitener = np.linalg.solve(root, np.broadcast_to(identity, root.shape))
+            half = crossed @ whitener.transpose(0, 2, 1)
+            gain = half @ whitener
+            e = runs.residuals[:, i] - (h @ x[:, :, None])[:, :, 0]
+            w = (whitener @ e[:, :, None])[:, :, 0]
+            likelihood -= np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+            likelihood -= 0.5 * np.square(w).sum(axis=1)
+            innovations[:, i], gains[:, i], whiteners[:, i] = e, gain, whitener
+            if i + 1 == samples:
+                break
+            x = x + (half @ w[:, :, None])[:, :, 0]
+            p = p - half @ half.transpose(0, 2, 1)
+            a = runs.states[:, i]
+            x = (a @ x[:, :, None])[:, :, 0] - runs.defects[:, i]
+            p = a @ p @ a.transpose(0, 2, 1) + excited[:, i]
+            p = 0.5 * (p + p.transpose(0, 2, 1))
+            # Of a motion that is unstable at this rate nothing is known after the step.
+            lost = ~(np.abs(p).max(axis=(1, 2)) < LARGEST_COVARIANCE)
+            if lost.any():
+                p[lost] = np.diag(np.square(runs.prior) + 1.0)
+    likelihood = np.nan_to_num(likelihood, nan=-np.inf)
     return Filtered(predicted, covariances, innovations, gains, whiteners, likelihood)
 
 
@@ -324,26 +325,28 @@ def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
     measured = np.zeros(count)
     expected = np.zeros(count)
     identity = np.eye(size)
-    for i in range(samples - 1, -1, -1):
-        h, w = runs.readings[:, i], filtered.whiteners[:, i]
-        weighed = w @ h
-        closed = identity - filtered.gains[:, i] @ h
-        if i + 1 < samples:
-            back = runs.states[:, i] @ closed
-            adjoint = (back.transpose(0, 2, 1) @ adjoint[:, :, None])[:, :, 0]
-            information = back.transpose(0, 2, 1) @ information @ back
-        white = (w @ filtered.innovations[:, i][:, :, None])[:, :, 0]
-        adjoint = adjoint - (weighed.transpose(0, 2, 1) @ white[:, :, None])[:, :, 0]
-        information = information + weighed.transpose(0, 2, 1) @ weighed
-        moved = (filtered.covariances[:, i] @ adjoint[:, :, None])[:, :, 0]
-        states[:, i] = filtered.predicted[:, i] - moved  # (6)
-        if i:
-            g = runs.forces[:, i - 1]
-            pushed = (g.transpose(0, 2, 1) @ adjoint[:, :, None])[:, :, 0]
-            forces[:, i - 1] = -np.square(sizes) * pushed
-            measured += np.square(pushed).sum(axis=0)
-            expected += np.einsum("rze,rzy,rye->e", g, information, g)
-    score = measured / np.maximum(expected, 1e-300)
+    with np.errstate(all="ignore"):
+        for i in range(samples - 1, -1, -1):
+            h, w = runs.readings[:, i], filtered.whiteners[:, i]
+            weighed = w @ h
+            closed = identity - filtered.gains[:, i] @ h
+            if i + 1 < samples:
+                back = runs.states[:, i] @ closed
+                adjoint = (back.transpose(0, 2, 1) @ adjoint[:, :, None])[:, :, 0]
+                information = back.transpose(0, 2, 1) @ information @ back
+            white = (w @ filtered.innovations[:, i][:, :, None])[:, :, 0]
+            adjoint = adjoint - (weighed.transpose(0, 2, 1) @ white[:, :, None])[:, :, 0]
+            information = information + weighed.transpose(0, 2, 1) @ weighed
+            moved = (filtered.covariances[:, i] @ adjoint[:, :, None])[:, :, 0]
+            states[:, i] = filtered.predicted[:, i] - moved  # (6)
+            if i:
+                g = runs.forces[:, i - 1]
+                pushed = (g.transpose(0, 2, 1) @ adjoint[:, :, None])[:, :, 0]
+                forces[:, i - 1] = -np.square(sizes) * pushed
+                measured += np.square(pushed).sum(axis=0)
+                expected += np.einsum("rze,rzy,rye->e", g, information, g)
+    states, forces = np.nan_to_num(states), np.nan_to_num(forces)
+    score = np.nan_to_num(measured / np.maximum(expected, 1e-300), nan=1.0)
     return Smoothed(states, forces, score)
 
 

@@ -78,7 +78,7 @@ def judged(fitted, held_out, left=NOTHING, base_error=1.0):
     simulated = np.full((1, 4, 1), base_error)
     measured = {(): SimpleNamespace(simulated=simulated, merit=100.0)}
     measured |= {(name,): SimpleNamespace(merit=m) for name, m in held_out.items()}
-    runs = SimpleNamespace(observed=np.zeros((1, 4, 1)))
+    runs = SimpleNamespace(world=SimpleNamespace(observed=np.zeros((1, 4, 1))))
     floor = SimpleNamespace(sigma=np.ones(1))
     finding = Finding("unknown", base, base, (), left, measured=measured)
     assessor = Assessor(None, None, runs, floor, None)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bench.gap.causes.name import _Inquiry, closed
+from bench.gap.causes.name import Inquiry, closed
 from tests.bench.gap.causes.models import model
 
 SIGMA = 0.1
@@ -72,7 +72,7 @@ def test_a_fuller_account_is_asked_for_where_causes_stand_and_something_is_left(
     search = SimpleNamespace(
         world=watch, to_the_end=lambda m: m, plainer=lambda m: PLAINER if m is FULLER else m
     )
-    inquiry = _Inquiry(search, None)
+    inquiry = Inquiry(search, None)
     inquiry._model = found
     if held_out:
         inquiry._trial = SimpleNamespace(
