@@ -40,12 +40,12 @@ from sims.robot.scales import floating_forces, scales
 from sims.robot.simulator import RobotSimulator
 from sims.system import Effect
 
-POSITION_PRIOR, VELOCITY_PRIOR = 20.0, 0.3
-"""Standard deviations of the first states about the measured motion: of positions in units of the
-noise, of velocities as a share of the largest one.
+POSITION_PRIOR, VELOCITY_PRIOR = 1.0, 0.3
+"""Standard deviations of the first states about the measured motion: of positions in rad or m,
+since an encoder may be off, of velocities as a share of the largest one.
 """
 LEAST_PRIOR = 1e-4
-"""The smallest ones, rad or m, and per second."""
+"""The smallest one of a velocity, rad/s or m/s."""
 LARGEST_PRIOR = 1e3
 """The largest one of a velocity, rad/s or m/s."""
 UNMEASURED_PRIOR, UNMEASURED_SPEED = 0.3, 3.0
@@ -191,7 +191,7 @@ class FollowedRuns:
         size = maps[0].states.shape[1]
         robot = world.simulator.robot
         typical = np.concatenate([scales(robot).force, floating_forces(robot)])
-        runs = LinearRuns.stacked(maps, world.observed, _prior(world, noise, linear, size))
+        runs = LinearRuns.stacked(maps, world.observed, _prior(world, linear, size))
         begin = FIRST_FORCE * typical if force is None else force
         begun = cls(world, theta, noise, linear, runs, begin, _NONE, _NOTHING, typical)
         return begun.refitted(runs)
@@ -345,6 +345,14 @@ class FollowedRuns:
         result[~(np.abs(result) < LARGEST)] = 0.0
         return result[..., columns.places] / columns.sizes
 
+    def first_positions(self) -> Array:
+        """Return smoothed positions of the joints at the first samples (R, D)."""
+        found = []
+        for run, linear in enumerate(self.linear):
+            x = linear.trajectory.x[int(linear.knots[0])]
+            found.append(x + self.smoothed.states[run, 0, : x.size])
+        return np.array(found)
+
     def first_states(self) -> Array:
         """Return positions and velocities of the joints at the first samples (R, 2 D): those of the
         readings alone where they are recorded, since a stiff servo hides the first velocity from a
@@ -376,20 +384,22 @@ class FollowedRuns:
         h, a = coloured.readings.astype(np.float32), coloured.states.astype(np.float32)
         gains = self.filtered.gains.astype(np.float32)
         whiteners = self.filtered.whiteners.astype(np.float32)
-        for run in range(number):
-            last = int(np.flatnonzero(self.runs.recorded[run].any(axis=1)).max(initial=0))
-            for begin in range(0, count, SIDE_BY_SIDE):
-                part = slice(begin, min(begin + SIDE_BY_SIDE, count))
-                s = np.zeros((a.shape[2], part.stop - part.start), dtype=np.float32)
-                for i in range(last + 1):
-                    u = h[run, i] @ s
-                    u += readings[run, i, :, part]
-                    np.matmul(whiteners[run, i], u, out=result[run, i, :, part])
-                    if i < last:
-                        s -= gains[run, i] @ u
-                        s = a[run, i] @ s
-                        more = pushed[run, i, :, part]
-                        s[:size] += more if inputs is None else inputs[run, i] @ more
+        with np.errstate(all="ignore"):
+            for run in range(number):
+                last = int(np.flatnonzero(self.runs.recorded[run].any(axis=1)).max(initial=0))
+                for begin in range(0, count, SIDE_BY_SIDE):
+                    part = slice(begin, min(begin + SIDE_BY_SIDE, count))
+                    s = np.zeros((a.shape[2], part.stop - part.start), dtype=np.float32)
+                    for i in range(last + 1):
+                        u = h[run, i] @ s
+                        u += readings[run, i, :, part]
+                        np.matmul(whiteners[run, i], u, out=result[run, i, :, part])
+                        if i < last:
+                            s -= gains[run, i] @ u
+                            s = a[run, i] @ s
+                            more = pushed[run, i, :, part]
+                            s[:size] += more if inputs is None else inputs[run, i] @ more
+        result[~np.isfinite(result)] = 0.0
         return result
 
 
@@ -424,7 +434,7 @@ def _linearised(
     return MeasuredLinear(robot, theta, scenario, start, given, nearby=nearby)
 
 
-def _prior(world: World, noise: Noise, linear: Sequence[MeasuredLinear], size: int) -> Array:
+def _prior(world: World, linear: Sequence[MeasuredLinear], size: int) -> Array:
     """(Z,) standard deviations of the first states about the measured motion.
 
     A stiff servo forgets the first velocity within a sample, so that the readings do not fix it.
@@ -435,8 +445,7 @@ def _prior(world: World, noise: Noise, linear: Sequence[MeasuredLinear], size: i
     speeds = np.max([np.abs(one.trajectory.v).max(axis=0) for one in linear], axis=0)
     for joint, name in enumerate(coordinates[:joints]):
         if name in world.channels:
-            sigma = float(noise.sigma[world.channels.index(name)])
-            prior[joint] = max(POSITION_PRIOR * sigma, LEAST_PRIOR)
+            prior[joint] = POSITION_PRIOR
             speed = VELOCITY_PRIOR * float(speeds[joint]) + LEAST_PRIOR
             prior[positions + joint] = min(speed, LARGEST_PRIOR)
         else:

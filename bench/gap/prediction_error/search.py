@@ -74,6 +74,10 @@ MAX_STEPS = 4
 """Maximum number of effects that are added one after another."""
 SOME = 0.1
 """Share of the stated dry friction that is taken away where less of it is tried."""
+OFF = 10.0
+"""A smoothed first position takes the place of the recorded one from so many times the noise."""
+ELSEWHERE = 100.0
+"""The model is linearised again where the smoothed motion has moved by so many times the noise."""
 FEW = 2
 """Sets of at most so many effects are fitted by simulation even where that is slow."""
 KEPT = 6
@@ -152,7 +156,7 @@ class PredictionErrorSearch(Search):
         only, own = self.base.fit.theta.copy(), self._plain_theta(start)
         for name in plain:
             only[self.world.slots[name]] = own[self.world.slots[name]]
-        best = self._fit(Start(plain, only, self._first_states))
+        best = self._fit(Start(plain, only, self._first_states(self.follow())))
         if self._is_explained(best):
             return self._lean(best)
         if softer and self._is_softer(best):
@@ -192,12 +196,18 @@ class PredictionErrorSearch(Search):
 
     # -- selection with the model linearised again after each effect
 
-    @property
-    def _first_states(self) -> Array:
-        """(R, s) smoothed states at the first samples: those of the base fit are bent by what is
-        missing.
+    def _first_states(self, followed: FollowedRuns) -> Array:
+        """(R, s) states at the first samples: those of the base fit are bent by what is missing.
+
+        Positions are smoothed with the effects in the model, since an encoder may be off.
         """
-        return self.world.guess
+        states, positions = self.world.guess.copy(), followed.first_positions()
+        own = states[:, : positions.shape[1]]
+        noise = float(np.nanmax(self.noise.sigma))
+        moved = np.abs(positions - own) > OFF * noise
+        fine = np.isfinite(positions) & moved & ~self.world.known[:, : positions.shape[1]]
+        states[:, : positions.shape[1]] = np.where(fine, positions, own)
+        return states
 
     def _step_by_step(self, selected: Selected, begin: Sequence[str]) -> Model:
         """Add effects one after another, each chosen by whole filters with the effect in the model.
@@ -242,7 +252,7 @@ class PredictionErrorSearch(Search):
                 break
         if not names:
             return self.base
-        fitted = self._fit(Start(tuple(names), theta, self._first_states))
+        fitted = self._fit(Start(tuple(names), theta, self._first_states(followed)))
         return self._lean(fitted) if np.isfinite(fitted.fit.cost) else self.base
 
     def _lean(self, model: Model) -> Model:
@@ -324,15 +334,22 @@ class PredictionErrorSearch(Search):
                 group, regression.solve([group])[1][0]
             )
             found[group.effect] = start
-        return [*found.items(), *self._of_joint_model(followed, theta, [*names, *found])]
+        return [
+            *found.items(),
+            *self._of_joint_model(followed, theta, [*names, *found]),
+        ]
 
     def _of_joint_model(
-        self, followed: FollowedRuns, theta: Array, names: Sequence[str]
+        self,
+        followed: FollowedRuns,
+        theta: Array,
+        names: Sequence[str],
     ) -> list[tuple[str, Array]]:
-        """The standard joint model at the joint where most is missing: dry friction, without what
-        the model file states of it, and armature, as large as the joint's own inertia.
+        """The standard joint model at the joint where most is missing: dry friction, less than the
+        model file states, armature, as large as the joint's own inertia, and an encoder's offset.
 
-        Neither is linear where a joint sticks, or where a servo is too stiff for a light joint.
+        None is linear: where a joint sticks, where a servo is too stiff for a light joint, and
+        where the pose is another one.
         """
         world = self.world
         assert isinstance(world.simulator, RobotSimulator)
@@ -341,6 +358,11 @@ class PredictionErrorSearch(Search):
         place = coordinates[joint].removeprefix("q.")
         inertia = float(scales(world.simulator.robot).inertia[joint])
         found = []
+        offset, apart = f"sensor.bias@q.{place}", self._from_command(joint)
+        if offset in world.library and offset not in names and apart:
+            start = theta.copy()
+            start[world.slots[offset]] = apart
+            found.append((offset, start))
         for effect in ("friction.coulomb", "inertia.armature"):
             name = f"{effect}@{place}"
             if name not in world.library or name in names:
@@ -369,6 +391,10 @@ class PredictionErrorSearch(Search):
             followed = known if turn == 0 and known is not None else None
             if followed is None:
                 followed = FollowedRuns.follow(world, theta, noise, motion, force=force)
+                if self._is_elsewhere(followed):
+                    # With an encoder that is off the motion is another one.
+                    own = followed.trajectories()
+                    followed = FollowedRuns.follow(world, theta, noise, own, force=force)
             likelihood = float(followed.filtered.log_likelihood.sum())
             if best is not None and likelihood < best[2]:
                 break
@@ -378,6 +404,30 @@ class PredictionErrorSearch(Search):
         assert best is not None
         self._tried = {best[0].tobytes(): best[1], **dict(list(self._tried.items())[:KEPT])}
         return best
+
+    def _from_command(self, joint: int) -> float:
+        """Mean distance of a joint's readings from the command of its position servo; zero where it
+        has none, or is near it.
+        """
+        world, system = self.world, self.world.simulator.system
+        channel = system.coordinates[joint]
+        servo = getattr(system, "servos", {}).get(joint)
+        if servo is None or channel not in world.channels:
+            return 0.0
+        column = world.channels.index(channel)
+        apart = []
+        for track in world.tracks:
+            inputs = track.scenario.inputs
+            if servo in inputs:
+                apart.append(track.observed[:, column] - system.gear(joint) * inputs[servo])
+        distance = float(np.nanmean(np.concatenate(apart))) if apart else 0.0
+        return distance if abs(distance) > OFF * self.noise.sigma[column] else 0.0
+
+    def _is_elsewhere(self, followed: FollowedRuns) -> bool:
+        """Whether the smoothed motion is far from that about which the model is linear."""
+        size = followed.linear[0].positions
+        moved = np.abs(followed.smoothed.states[:, :, :size])
+        return bool(moved.max() > ELSEWHERE * float(np.nanmax(self.noise.sigma)))
 
     def _improved(self, followed: FollowedRuns, theta: Array, names: Sequence[str]) -> Array:
         """The coefficients of effects after a Gauss-Newton step on the innovations."""
@@ -527,7 +577,7 @@ class PredictionErrorSearch(Search):
         if not selected.groups:
             return self.base
         start = self._start(selected.groups, selected.coefficients)
-        found = self._fit(start)
+        found = self._fit(replace(start, states=self._first_states(selected.followed)))
         if not np.isfinite(found.fit.cost):
             return self.base
         found = self._lean(found)
@@ -601,7 +651,7 @@ class PredictionErrorSearch(Search):
         self, groups: Sequence[Group], coefficients: Sequence[Array], fit: Fit | None = None
     ) -> Start:
         """Where the fit of a set by simulation begins."""
-        states = self._first_states if fit is None else fit.states
+        states = self.base.fit.states if fit is None else fit.states
         theta = self.base.fit.theta.copy()
         for group, own in zip(groups, coefficients, strict=True):
             theta[self.world.slots[group.effect]] = self._numbers(group, own)
