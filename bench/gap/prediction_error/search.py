@@ -768,7 +768,8 @@ class PredictionErrorSearch(Search):
         for name in start.effects:
             c = start.theta[self.world.slots[name]]
             for k in range(c.size):
-                step = probes[place + 1 + k].c[k] - c[k]
+                # A coefficient without a range has no derivative.
+                step = float(probes[place + 1 + k].c[k] - c[k]) or np.inf
                 columns.append((changes[..., place + 1 + k] - changes[..., place]) / step)
             place += 1 + c.size
         known = Known(np.array(free, dtype=np.intp), np.stack(columns, axis=3))
