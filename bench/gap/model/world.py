@@ -4,7 +4,7 @@ lanes in one call.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -89,6 +89,8 @@ class World:
         simulated: what effects without a tangent change about them, by name and coefficients.
         followed: the runs of a robot as a filter follows them, if it does
             (`bench.gap.prediction_error.candidate_responses`).
+        measured: of runs of a robot, states from readings alone
+            (`bench.gap.prediction_error.measured_states`).
         crew: who simulates and fits; this process alone, unless another is put here.
 
     Args:
@@ -160,6 +162,7 @@ class World:
         self.neighbourhoods: dict[tuple[int, bytes, bytes], Any] = {}
         self.simulated: dict[tuple[str, bytes], Array] = {}
         self.followed: Any = None
+        self.measured: dict[int, Mapping[int, Array]] = {}
         self.simulations = 0
         self._cache = LaneCache()
         self.watch = Watch()

@@ -38,6 +38,13 @@ def measured_states(world: World, sigma: Array, run: int) -> Mapping[int, Array]
     Returns:
         By number of the joint, (T, 3) at the samples.
     """
+    if run not in world.measured:
+        world.measured[run] = _measured(world, sigma, run)
+    return world.measured[run]
+
+
+def _measured(world: World, sigma: Array, run: int) -> Mapping[int, Array]:
+    """Estimate the states of `measured_states`."""
     coordinates, rates = world.simulator.system.coordinates, world.simulator.system.rates
     track = world.tracks[run]
     times, observed = track.scenario.times, track.observed

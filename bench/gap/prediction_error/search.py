@@ -149,7 +149,7 @@ class PredictionErrorSearch(Search):
         """
         if not self._needs_noise(selected):
             return self.base
-        plain, softer = self._form_of_friction(selected)
+        plain = self._plain_friction(selected)
         if not plain:
             return self.base
         start = self._start(selected.groups, selected.coefficients)
@@ -159,9 +159,20 @@ class PredictionErrorSearch(Search):
         best = self._fit(Start(plain, only, self._first_states(self.follow())))
         if self._is_explained(best):
             return self._lean(best)
+        stands, softer = self._form_of_friction(selected)
+        if not stands:
+            return best
         if softer and self._is_softer(best):
             raise SoftFrictionError
-        return self._step_by_step(selected, plain)
+        return self._better(best, self._step_by_step(selected, plain))
+
+    def _plain_friction(self, selected: Selected) -> tuple[str, ...]:
+        """The dry friction of a selection, without a state; a family in place of its members."""
+        world = self.world
+        plain = dict.fromkeys(plain_friction(world, name) for name in selected.effects)
+        native = [name for name in plain if name.partition("@")[0] in FIELDS]
+        names = [name for name in native if has_dry_friction(world, [name])]
+        return tuple(n for n in names if not any(n in world.effects[m].contains for m in names))
 
     def _needs_noise(self, selected: Selected) -> bool:
         """Whether forces are still missing beside what was selected."""
@@ -472,18 +483,14 @@ class PredictionErrorSearch(Search):
         other.close()
         return soft is not None
 
-    def _form_of_friction(self, selected: Selected) -> tuple[tuple[str, ...], bool]:
-        """The dry friction without a state that follows the data as well as what was selected, and
+    def _form_of_friction(self, selected: Selected) -> tuple[bool, bool]:
+        """Whether dry friction without a state follows the data as well as what was selected, and
         whether it does better in MuJoCo's soft form.
 
         The force of friction is not linear in its limit where a joint sticks or creeps, so whole
         models are followed.
         """
         world = self.world
-        plain_names = [plain_friction(world, name) for name in selected.effects]
-        native = [n for n in plain_names if n.partition("@")[0] in FIELDS]
-        if not has_dry_friction(world, native):
-            return (), False
         robot: Any = world.kind
         start = self._start(selected.groups, selected.coefficients)
         plain = self._plain_theta(start)
@@ -493,11 +500,8 @@ class PredictionErrorSearch(Search):
         softer = -np.inf if is_soft else self._likelihood(plain, soft_kind(world.kind))
         own = self._likelihood(start.theta, world.kind) if has_state else -np.inf
         best = max(likelihood, softer)
-        names = tuple(dict.fromkeys(n for n in native if has_dry_friction(world, [n])))
-        # A family has all its members.
-        names = tuple(n for n in names if not any(n in world.effects[m].contains for m in names))
         stands = best > own - 0.5 * SWITCH
-        return names if stands else (), softer > max(likelihood, own) + 0.5 * SWITCH
+        return stands, softer > max(likelihood, own) + 0.5 * SWITCH
 
     def _likelihood(self, theta: Array, kind: type[Simulated]) -> float:
         """The log likelihood of the innovations with a simulator and its parameters."""
