@@ -66,7 +66,7 @@ NEEDED = 20.0
 """Twice the log likelihood that the process noise of a joint must gain to be needed there."""
 RIVAL = 20.0
 """Rivals this near in twice the log likelihood of the regression are fitted by simulation."""
-LINEAR = 0.007
+LINEAR = 0.03
 """Share of a gain by which it may be wrong, since responses are linear."""
 MAX_RIVALS = 3
 """Maximum number of rivals of each effect that are fitted by simulation."""
@@ -306,7 +306,9 @@ class PredictionErrorSearch(Search):
         theta = model.fit.theta.copy()
         contained = self.world.effects[name].contains
         for other in contained:
-            theta[self.world.slots[other]] = 0.0
+            # What is free is no effect.
+            if other in self.world.slots:
+                theta[self.world.slots[other]] = 0.0
         theta[self.world.slots[name]] = self._numbers(group, coefficients)
         names = (*(n for n in model.names if n not in contained), name)
         self.refit([Start(names, theta, model.fit.states)], race=False)
@@ -340,7 +342,8 @@ class PredictionErrorSearch(Search):
                 break
             start = theta.copy()
             for contained in self.world.effects[group.effect].contains:
-                start[self.world.slots[contained]] = 0.0
+                if contained in self.world.slots:
+                    start[self.world.slots[contained]] = 0.0
             start[self.world.slots[group.effect]] = self._numbers(
                 group, regression.solve([group])[1][0]
             )
@@ -610,14 +613,20 @@ class PredictionErrorSearch(Search):
         if not best.names or not np.isfinite(best.fit.cost):
             return best
         starts = []
+        own = float(self._followed_by(best).filtered.log_likelihood.sum())
         for name in best.names:
-            for group, coefficients, _ in self._rivals(best, name):
+            for group, coefficients, behind in self._rivals(best, name):
                 names = (*(n for n in best.names if n != name), group.effect)
                 if frozenset(names) in self.models:
                     continue
                 theta = best.fit.theta.copy()
                 theta[self.world.slots[name]] = 0.0
                 theta[self.world.slots[group.effect]] = self._numbers(group, coefficients)
+                if behind > RIVAL:
+                    # Regression is linear; a filter with the rival in the model is not.
+                    theta, _, likelihood = self._refined(theta, names)
+                    if 2.0 * (own - likelihood) > RIVAL:
+                        continue
                 starts.append(Start(names, theta, best.fit.states))
         if starts:
             self.refit(starts, race=False)
