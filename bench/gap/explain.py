@@ -10,19 +10,20 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from bench.gap.assess import Assessor
 from bench.gap.causes.name import Finding, answer, name
+from bench.gap.causes.rules import SWITCH
 from bench.gap.causes.search import Search
 from bench.gap.causes.structure import probes, remains
 from bench.gap.cross_validation import CrossValidation
 from bench.gap.design import Design, design
 from bench.gap.explanation import Explanation
 from bench.gap.freeze import frozen
-from bench.gap.friction_form import soft_kind
+from bench.gap.friction_form import choose_friction_form, has_dry_friction, soft_kind
 from bench.gap.held_out import HeldOutRuns, Validation
 from bench.gap.model.base_fit import LAST_STEPS, Base, fit_base, without_step
 from bench.gap.model.crew import Crew
@@ -362,9 +363,12 @@ class _Explainer:
         from bench.gap.prediction_error.search import SoftFrictionError
 
         try:
-            return _Found(base, search, self._finding(search), rng)
+            found = _Found(base, search, self._finding(search), rng)
+            if not self._is_free_friction_soft(found):
+                return found
         except SoftFrictionError:
-            self.say(SOFT_FRICTION)
+            pass
+        self.say(SOFT_FRICTION)
         before = self.assessor.before
         self._enter(soft_kind(self.kind))
         self.assessor = replace(self.assessor, before=before)
@@ -379,6 +383,19 @@ class _Explainer:
     def _answered(self, base: Base) -> _Found:
         """The answer from a base model that was fitted with another step."""
         return self._searched(self._settled(base))
+
+    def _is_free_friction_soft(self, found: _Found) -> bool:
+        """Whether dry friction that is a free number fits better in MuJoCo's soft form."""
+        kind: Any = self.kind
+        if not has_dry_friction(self.fitting, ()) or kind.robot.friction_form == "soft":
+            return False
+        if self.watch.left() or self.faults:
+            return False
+        other = self._world(soft_kind(self.kind), self.fitting.runs)
+        other.follow(self.fitting.followed)
+        soft = choose_friction_form(found.search, found.finding.model, other, SWITCH)
+        other.close()
+        return soft is not None
 
     def _finding(self, search: Search) -> Finding:
         """What the simulator lacks; no cause where the recording states a unit or a sign wrongly,

@@ -304,7 +304,8 @@ def terminal_output(command, columns=120, interrupt_at=None):
 def command(tmp_path):
     """The words of an explanation of a small recording."""
     log = str(tmp_path / "swing.csv")
-    make = ["simulate", "pendulum", "--effect", "drag.linear=1e-3", "--noise", "q=0.003"]
+    noise = ["--noise", "q=0.003", "qd=0.02"]
+    make = ["simulate", "pendulum", "--effect", "drag.linear=1e-3", *noise]
     assert main([*make, "--runs", "3", "--seconds", "1", "--rate", "60", "--out", log]) == 0
     return [sys.executable, "-m", "bench.cli", "explain", log, "--out", str(tmp_path / "out")]
 
