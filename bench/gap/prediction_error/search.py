@@ -133,8 +133,32 @@ class PredictionErrorSearch(Search):
             best = self._better(best, self._fitted(selected))
         if not best.names:
             best = self._confirmed(selected)
+        best = self._with_fewer(best)
         self.supported = best
         return best
+
+    def _with_fewer(self, best: Model) -> Model:
+        """One effect in place of several, where a filter with it in the model does as well: two
+        laws that are linear may stand for one that is not.
+        """
+        if len(best.names) < 2 or not self._is_explained(best) or self._is_cut:
+            return best
+        theta = self.base.fit.theta
+        tried = [
+            (*self._refined(start, [name], turns=0), name)
+            for name, start in self._promising(self.follow(), theta, [])
+        ]
+        if not tried:
+            return best
+        first = max(tried, key=lambda one: 2.0 * one[2] - self._price(one[3]))
+        name = first[3]
+        theta, followed, likelihood = self._refined(first[0], [name])
+        own = float(self._followed_by(best).filtered.log_likelihood.sum())
+        price = sum(self._price(one) for one in best.names) - self._price(name)
+        if 2.0 * (own - likelihood) > price + RIVAL:
+            return best
+        single = self._fit(Start((name,), theta, self._first_states(followed)))
+        return self._better(single, best)
 
     @staticmethod
     def _better(one: Model, other: Model) -> Model:

@@ -306,7 +306,7 @@ def command(tmp_path):
     log = str(tmp_path / "swing.csv")
     noise = ["--noise", "q=0.003", "qd=0.02"]
     make = ["simulate", "pendulum", "--effect", "drag.linear=1e-3", *noise]
-    assert main([*make, "--runs", "3", "--seconds", "1", "--rate", "60", "--out", log]) == 0
+    assert main([*make, "--runs", "3", "--seconds", "3", "--rate", "60", "--out", log]) == 0
     return [sys.executable, "-m", "bench.cli", "explain", log, "--out", str(tmp_path / "out")]
 
 
