@@ -25,6 +25,8 @@ STAGES = ((0.2, 6), (0.45, 6), (0.7, 6), (1.0, 10))
 """Shares of a run over which its initial state is fitted one after another, and steps of each."""
 FOLLOWED = ((1.0, 6),)
 """The same of a robot whose runs a filter has followed: they begin near their best states."""
+FAR = 1.5
+"""Mean square, in units of the noise, from which the nearest model is fitted in stages too."""
 BENT = 0.3
 """RMS, in units of the noise, by which a motion may miss what derivatives by its initial states
 make of it, before these are taken anew.
@@ -123,6 +125,11 @@ class HeldOutRuns:
         begun = [Start((), theta, guess) for theta in thetas]
         followed = self.world.followed is not None
         fits = self._fitted(begun, FOLLOWED if followed else STAGES)
+        count = max(int(self.seen.sum()), 1)
+        # A run that amplifies where it begins is followed from its beginning on.
+        if followed and not _nearest(fits).cost < FAR * count:
+            fits = _each_nearer(fits, self._fitted(begun, STAGES))
+            followed = False
         if not followed and self._bends(_nearest(fits)):
             fits = self._led(begun, fits)
         nearest = _nearest(fits)

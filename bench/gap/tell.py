@@ -128,6 +128,9 @@ class Teller:
         """What the recording can say at all, by what was simulated about the base model anyway."""
         key: frozenset[str] = frozenset()
         scanned = self.search.scanned.get(key) or self.search.former.get(key)
+        known = self.search.directions_known()
+        if known is not None:
+            return identified(self.search.world, self.search.noise, *known)
         if scanned is None:
             return ()
         return identified(self.search.world, self.search.noise, scanned.at, scanned.directions)

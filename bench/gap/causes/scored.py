@@ -91,6 +91,12 @@ class Scored(Models):
             return self.scored.get(key)
         return self.former[key].scores
 
+    def directions_known(self) -> tuple[Fit, Directions] | None:
+        """Return what every candidate changes about the base model's runs; None where it has not
+        been found beside the scores.
+        """
+        return None
+
     def replaced(self, key: frozenset[str]) -> None:
         """What was scored about the model before holds no longer."""
         self.scored.pop(key, None)

@@ -331,7 +331,10 @@ class FollowedRuns:
         """Return what candidates change about the readings of simulated runs (R, T, C, K), by (1)
         without gain.
         """
-        columns = self.columns(probes)
+        return self.sensitivities(self.columns(probes))
+
+    def sensitivities(self, columns: Columns) -> Array:
+        """Return the same of columns that are known."""
         number, samples, channels, count = columns.readings.shape
         size = self.runs.prior.size
         result = np.zeros((number, samples, channels, count))

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc
 
-from bench.gap.causes.candidates import Probe, _first
+from bench.gap.causes.candidates import Directions, Probe, _first
 from bench.gap.causes.gains import Group
 from bench.gap.causes.joint_hats import JointHat
 from bench.gap.causes.rules import ALPHA, SWITCH
@@ -811,6 +811,14 @@ class PredictionErrorSearch(Search):
             place += 1 + c.size
         known = Known(np.array(free, dtype=np.intp), np.stack(columns, axis=3))
         return replace(start, known=known)
+
+    def directions_known(self) -> tuple[Fit, Directions] | None:
+        """Return what every candidate changes about the base model's runs, to first order about the
+        measured motion.
+        """
+        columns = self._plain_columns()
+        values = self.follow().sensitivities(columns)
+        return self.base.fit, Directions(columns.probes, values)
 
     def force_of_any_shape(self, model: Model) -> tuple[float, str] | None:
         """Return the p-value of the best force of any shape, and what it follows."""
