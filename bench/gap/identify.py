@@ -105,7 +105,10 @@ class _Identified:
     def numbers(self) -> tuple[Number, ...]:
         free = self._free()
         causes = sorted(
-            self._causes(), key=lambda n: np.nan_to_num(n.half) / max(n.high - n.low, 1e-300)
+            self._causes(),
+            key=lambda n: (
+                float(np.nan_to_num(n.half)) / (n.high - n.low if n.high > n.low else np.inf)
+            ),
         )
         return (*free, *causes)
 

@@ -131,17 +131,61 @@ class PredictionErrorSearch(Search):
         if not self._is_explained(best):
             selected = self._with_many_shapes(selected)
             best = self._better(best, self._fitted(selected))
+        if not self._is_explained(best) and not self._is_cut:
+            best = self._better(best, self._in_series(selected))
         if not best.names:
             best = self._confirmed(selected)
         best = self._with_fewer(best)
         self.supported = best
         return best
 
+    def _in_series(self, selected: Selected) -> Model:
+        """The best model with what gives between a drive and its links, at the joint where most is
+        missing. It has states of its own and no small size, so that it is simulated at each shape.
+        """
+        joint = int(np.argmax(selected.followed.needs_process_noise()))
+        effects = self.world.effects
+        names = [n for n in self.world.library if is_series(effects[n])]
+        probes = self._probes([n for n in names if self._acts_at(n, {joint})])
+        runs = len(self.world.tracks)
+        if not probes:
+            return self.base
+        self.world.watch.stage("testing what gives between drive and links", len(probes))
+        thetas = []
+        for probe in probes:
+            theta = self.base.fit.theta.copy()
+            theta[self.world.slots[probe.effect]] = probe.c
+            thetas.append(theta)
+        simulated = self.world.simulate(
+            np.repeat(thetas, runs, axis=0),
+            np.tile(np.arange(runs), len(probes)),
+            np.tile(self.world.guess, (len(probes), 1)),
+        ).reshape(len(probes), *self.world.observed.shape)
+        left = np.where(self.seen, (self.world.observed - simulated) / self.noise.sigma, 0.0)
+        with np.errstate(all="ignore"):
+            costs = np.nan_to_num(np.square(left).sum(axis=(1, 2, 3)), nan=np.inf)
+        best: dict[str, int] = {}
+        for i in np.argsort(costs, kind="stable").tolist():
+            best.setdefault(probes[i].effect, i)
+        starts = [Start((name,), thetas[i], self.world.guess) for name, i in best.items()]
+        self.refit(starts, race=False)
+        fitted = [self.models[frozenset((name,))] for name in best]
+        return max(fitted, key=lambda model: model.merit)
+
+    def _has_series(self, model: Model) -> bool:
+        """Whether a model has joints in series with others, and so states of its own."""
+        return any(is_series(self.world.effects[name]) for name in model.names)
+
     def _with_fewer(self, best: Model) -> Model:
         """One effect in place of several, where a filter with it in the model does as well: two
         laws that are linear may stand for one that is not.
         """
-        if len(best.names) < 2 or not self._is_explained(best) or self._is_cut:
+        if (
+            len(best.names) < 2
+            or self._has_series(best)
+            or not self._is_explained(best)
+            or self._is_cut
+        ):
             return best
         theta = self.base.fit.theta
         tried = [
@@ -634,7 +678,7 @@ class PredictionErrorSearch(Search):
 
     def with_rivals(self, best: Model) -> Model:
         """Fit the sets that do nearly as well by the regression, and return the best of all."""
-        if not best.names or not np.isfinite(best.fit.cost):
+        if not best.names or not np.isfinite(best.fit.cost) or self._has_series(best):
             return best
         starts = []
         own = float(self._followed_by(best).filtered.log_likelihood.sum())
@@ -773,6 +817,10 @@ class PredictionErrorSearch(Search):
     def scan(self, model: Model, against: Array | None = None) -> Scores:  # noqa: ARG002
         """Score every effect that the model lacks by the innovations."""
         key = frozenset(model.names)
+        if key not in self.scored and self._has_series(model):
+            # The candidates are linear about the robot without further joints.
+            self.scored[key] = replace(self.scan(self.base), p_value=1.0)
+            self.tests[key] = 1.0
         if key not in self.scored:
             self._look(model)
             regression = self._regression(model)
@@ -822,6 +870,8 @@ class PredictionErrorSearch(Search):
 
     def force_of_any_shape(self, model: Model) -> tuple[float, str] | None:
         """Return the p-value of the best force of any shape, and what it follows."""
+        if self._has_series(model):
+            return None
         regression = self._regression(model)
         labels = {probe.effect for probe in self._hat_columns().probes}
         scores = null_scores(regression, labels, self.drawing("structure", model.names))
