@@ -411,7 +411,7 @@ class _Explainer:
 
     def _named(self, search: Search) -> Finding:
         """Answer the questions about a recording; about a robot's by prediction errors."""
-        if not self.kind.has_model:
+        if self.fitting.followed is None:
             return name(search, self.validation)
         # Loaded where there is a robot alone.
         from bench.gap.prediction_error.confirmation import Confirmation
@@ -471,7 +471,7 @@ class _Explainer:
 
     def _kind_of_search(self) -> type[Search]:
         """Search by prediction errors where the simulator can be linearised."""
-        if not self.kind.has_model:
+        if self.fitting.followed is None:
             return Search
         # Loaded where there is a robot alone.
         from bench.gap.prediction_error.search import PredictionErrorSearch
@@ -505,9 +505,14 @@ class _Explainer:
         # Loaded where there is a robot alone.
         from bench.gap.prediction_error.candidate_responses import FollowedRuns
 
+        followed = []
         for world in self._worlds():
             self.watch.stage("following the runs with the model")
-            world.follow(FollowedRuns.follow(world, world.nominal(), self.noise, None))
+            followed.append(FollowedRuns.follow(world, world.nominal(), self.noise, None))
+        # Where the linear model explodes, causes are searched by simulation.
+        if all(one.is_sound for one in followed):
+            for world, one in zip(self._worlds(), followed, strict=True):
+                world.follow(one)
 
     def _prepared(self, base: Base) -> Base:
         """The base model of a robot with the step that the data ask for, and without free numbers
@@ -519,7 +524,8 @@ class _Explainer:
 
     def _shows_steps(self, base: Base) -> bool:
         """Whether the recording shows what the engine's steps miss."""
-        if self.watch.left() or not np.isfinite(base.fit.cost):
+        lost = self.fitting.followed is None or not np.isfinite(base.fit.cost)
+        if self.watch.left() or lost:
             return True
         # Loaded where there is a robot alone.
         from bench.gap.prediction_error.search import PredictionErrorSearch

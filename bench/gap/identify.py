@@ -104,12 +104,7 @@ class _Identified:
 
     def numbers(self) -> tuple[Number, ...]:
         free = self._free()
-        causes = sorted(
-            self._causes(),
-            key=lambda n: (
-                float(np.nan_to_num(n.half)) / (n.high - n.low if n.high > n.low else np.inf)
-            ),
-        )
+        causes = sorted(self._causes(), key=_share_of_range)
         return (*free, *causes)
 
     def _without_states(self, columns: Array) -> Array:
@@ -280,3 +275,10 @@ def listed(names: Sequence[str], most: int) -> str:
 
 
 _WORDS: tuple[Word, ...] = ("identifiable", "weak", "not identifiable")
+
+
+def _share_of_range(number: Number) -> float:
+    """Half the width of a number's interval, as a share of its plausible range."""
+    width = number.high - number.low
+    with np.errstate(over="ignore"):
+        return float(np.nan_to_num(number.half) / width) if width > 0 else 0.0

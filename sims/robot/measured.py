@@ -43,6 +43,8 @@ from sims.system import Acting, Input, Sensor
 
 SingleArray = NDArray[np.float32]
 
+FARTHEST = 1e3
+"""Largest deviation of a smoothed state from the measured motion, SI units."""
 BLOCK = 64
 """Number of candidates whose responses are computed together."""
 LONGEST_HELD = 0.02
@@ -160,7 +162,8 @@ class MeasuredLinear(Linear):
 
     def _from_samples(self, motion: Motion) -> Trajectory:
         """Interpolate the measured joints between samples by quintic Hermite polynomials."""
-        x, v = motion.x.copy(), motion.v.copy()
+        # Joints that are not recorded may explode in the simulation.
+        x, v = (np.clip(np.nan_to_num(u), -FARTHEST, FARTHEST) for u in (motion.x, motion.v))
         steps: Array = self._simulator.step * np.arange(float(len(x)))
         for joint, samples in self._measured.items():
             x[:, joint], v[:, joint] = quintic(self._times, samples, steps)
@@ -316,16 +319,19 @@ class MeasuredLinear(Linear):
             defects = tangent.defects
         result = np.zeros((self._motion.x.shape[0], tangent.size))
         now = begun[:-1].copy()
-        for steps, active in self._within():
-            result[steps] = now[active]
-            ahead = np.einsum("izy,iy->iz", quotients.states[of[steps]], now[active])
-            push = np.einsum("ize,ie->iz", quotients.forces[of[steps]], forces[active])
-            now[active] = ahead - defects[steps] + push
+        with np.errstate(all="ignore"):
+            for steps, active in self._within():
+                result[steps] = now[active]
+                ahead = np.einsum("izy,iy->iz", quotients.states[of[steps]], now[active])
+                push = np.einsum("ize,ie->iz", quotients.forces[of[steps]], forces[active])
+                now[active] = ahead - defects[steps] + push
         result[self.knots[-1] :] = begun[-1]
         return result
 
     def moved(self, deviations: Array) -> Trajectory:
         """Return the motion moved by deviations (S + 1, Z) of states."""
+        # Where the linear model explodes the motion stays as it is.
+        deviations = np.where(np.abs(deviations) < FARTHEST, deviations, 0.0)
         own, motion = len(self._simulator.addresses.positions), self._motion
         size, na = motion.x.shape[1], motion.act.shape[1]
         floating = self._simulator.wide(self._work.acting).floating

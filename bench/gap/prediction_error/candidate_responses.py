@@ -61,6 +61,8 @@ COLOURED = 5.0
 """Log likelihood that a larger correlation must gain."""
 SHOWN = 7.0
 """Twice the log likelihood that the errors of the integrator's steps must gain."""
+UNSOUND = 100.0
+"""Mean square of the whitened innovations above which a linear model does not follow the runs."""
 SIDE_BY_SIDE = 256
 """Number of columns that go through the filter together, so that they stay in the cache."""
 
@@ -305,7 +307,10 @@ class FollowedRuns:
         inputs = self.runs.inputs.astype(np.float32)
         found = self._through_filter(columns.pushed, columns.readings, inputs)
         sizes: SingleArray = columns.sizes.astype(np.float32)
-        result: SingleArray = found[..., columns.places] / sizes
+        with np.errstate(all="ignore"):
+            result: SingleArray = found[..., columns.places] / sizes
+        # A response of a candidate with which the motion explodes is none.
+        result[~(np.abs(result) < LARGEST)] = 0.0
         return result
 
     def state_sensitivities(self) -> Array:
@@ -346,7 +351,15 @@ class FollowedRuns:
                 if i + 1 < samples:
                     s = a[:, i] @ s + by[:, i] @ columns.pushed[:, i]
         result[~(np.abs(result) < LARGEST)] = 0.0
-        return result[..., columns.places] / columns.sizes
+        with np.errstate(all="ignore"):
+            return result[..., columns.places] / columns.sizes
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the filter follows the runs: its innovations are of the size that it expects."""
+        with np.errstate(all="ignore"):
+            size = float(np.square(self.filtered.whitened).sum()) / max(self.runs.recorded.sum(), 1)
+        return bool(size < UNSOUND)
 
     def first_positions(self) -> Array:
         """Return smoothed positions of the joints at the first samples (R, D)."""

@@ -445,12 +445,14 @@ class PredictionErrorSearch(Search):
             start = theta.copy()
             start[world.slots[offset]] = apart
             found.append((offset, start))
-        for effect in ("friction.coulomb", "inertia.armature"):
+        speed = max(float(np.abs(one.trajectory.v[:, joint]).max()) for one in followed.linear)
+        damping = SOME * float(followed.typical[joint]) / max(speed, 1e-9)
+        for effect in ("friction.coulomb", "inertia.armature", "drag.linear"):
             name = f"{effect}@{place}"
             if name not in world.library or name in names:
                 continue
             low, high = coefficient_bounds(world, name)[0]
-            value = inertia if effect == "inertia.armature" else SOME * low
+            value = {"inertia.armature": inertia, "drag.linear": damping}.get(effect, SOME * low)
             if value:
                 start = theta.copy()
                 start[world.slots[name]] = np.clip(value, low, high)

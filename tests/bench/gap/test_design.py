@@ -72,7 +72,7 @@ def names_of(explanation):
 
 @pytest.mark.slow
 def test_the_proposed_run_splits_the_set(tmp_path):
-    before = write(tmp_path, "before", slow(), lag=0.04)
+    before = write(tmp_path, "before", slow(4), lag=0.04)
     proposed = simgap.design(before)
     ambiguous = names_of(proposed.explanation)
     assert {"input.lag", "input.delay"} <= ambiguous
