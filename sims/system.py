@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from types import MappingProxyType
-from typing import ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -528,6 +528,12 @@ class Effect(ABC):
 def _is_joint(system: System | type[System]) -> bool:
     """Whether it is a single joint, declared in equations."""
     return len(system.coordinates) == 1 and not system.bounces and not system.has_model
+
+
+def members_of(effect: Effect | type[Effect]) -> Sequence[Any]:
+    """Return the members of a family, which are instances; any other effect alone."""
+    members: Sequence[Any] = getattr(effect, "members", ()) or (effect,)
+    return members
 
 
 class Force(Effect):

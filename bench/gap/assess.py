@@ -29,7 +29,7 @@ from sims.base import Array
 from sims.extended import Number
 from sims.recording.recording import Recording
 from sims.robot.causes import GRAVITY_COMPENSATED, is_gravity_compensated
-from sims.system import Effect
+from sims.system import Effect, members_of
 
 WORST = -9.0
 """A candidate's share of the held-out gap is cut here: it has made things worse, by whatever."""
@@ -169,7 +169,7 @@ class Assessor:
             yield effect, [next(places) for _ in effect.coefficients]
         for name in model.names:
             effect = world.effects[name]
-            members = getattr(effect, "members", ()) or (effect,)
+            members = members_of(effect)
             places = iter(world.places(name))
             # A family with one number for all places changes no number of the file.
             if sum(len(member.coefficients) for member in members) == len(world.places(name)):

@@ -10,7 +10,7 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from bench.gap.cross_validation import CrossValidation
 from bench.gap.design import Design, design
 from bench.gap.explanation import Explanation
 from bench.gap.freeze import frozen
-from bench.gap.friction_form import choose_friction_form, has_dry_friction, soft_kind
+from bench.gap.friction_form import has_dry_friction, is_likelier_soft, soft_kind
 from bench.gap.held_out import HeldOutRuns, Validation
 from bench.gap.model.base_fit import LAST_STEPS, Base, fit_base, without_step
 from bench.gap.model.crew import Crew
@@ -63,7 +63,7 @@ SOFT_FRICTION = (
     "dry friction has MuJoCo's soft form (solreffriction and solimpfriction of the model file): "
     "it fits better than stiff friction"
 )
-"""What the user is told where the form of dry friction changes."""
+"""Message to the user where the form of dry friction changes."""
 if TYPE_CHECKING:
     from bench.gap.model.numerics import Finer
     from bench.gap.prediction_error.candidate_responses import FollowedRuns
@@ -364,7 +364,10 @@ class _Explainer:
 
         try:
             found = _Found(base, search, self._finding(search), rng)
-            if not self._is_free_friction_soft(found):
+            # A search does not select dry friction that is a free number.
+            is_free = has_dry_friction(self.fitting, ())
+            done = self.watch.left() or bool(self.faults) or not is_free
+            if done or not is_likelier_soft(search, found.finding.model, SWITCH):
                 return found
         except SoftFrictionError:
             pass
@@ -375,7 +378,7 @@ class _Explainer:
         fitter = Fitter(self.fitting, self.noise, base.frozen)
         start = replace(base.fit.start(), states=self.fitting.guess)
         (fit,) = fitter.fit([start], LAST_STEPS)
-        base = without_step(self.fitting, self.noise, replace(base, fit=fit))
+        base = self._without_step(replace(base, fit=fit))
         rng = self._rng()
         search = self._search(base, rng)
         return _Found(base, search, self._finding(search), rng)
@@ -383,19 +386,6 @@ class _Explainer:
     def _answered(self, base: Base) -> _Found:
         """The answer from a base model that was fitted with another step."""
         return self._searched(self._settled(base))
-
-    def _is_free_friction_soft(self, found: _Found) -> bool:
-        """Whether dry friction that is a free number fits better in MuJoCo's soft form."""
-        kind: Any = self.kind
-        if not has_dry_friction(self.fitting, ()) or kind.robot.friction_form == "soft":
-            return False
-        if self.watch.left() or self.faults:
-            return False
-        other = self._world(soft_kind(self.kind), self.fitting.runs)
-        other.follow(self.fitting.followed)
-        soft = choose_friction_form(found.search, found.finding.model, other, SWITCH)
-        other.close()
-        return soft is not None
 
     def _finding(self, search: Search) -> Finding:
         """What the simulator lacks; no cause where the recording states a unit or a sign wrongly,
@@ -528,17 +518,28 @@ class _Explainer:
         if self.watch.left() or lost:
             return True
         # Loaded where there is a robot alone.
-        from bench.gap.prediction_error.search import PredictionErrorSearch
+        from bench.gap.prediction_error.candidate_responses import FollowedRuns
+        from bench.gap.prediction_error.identification import shows_step_errors
 
-        search = self._search(base, self._rng())
-        assert isinstance(search, PredictionErrorSearch)
-        return search.follow().shows_step_errors()
+        return shows_step_errors(FollowedRuns.of_model(self.fitting, base.fit.theta, self.noise))
+
+    def _without_step(self, base: Base) -> Base:
+        """The base model without the errors of the engine's steps, where the recording shows them
+        or no filter could tell.
+        """
+        # Loaded where there is a robot alone.
+        from bench.gap.prediction_error.identification import shows_step_errors
+
+        followed = self.fitting.followed
+        if followed is not None and not shows_step_errors(followed):
+            return base
+        return without_step(self.fitting, self.noise, base)
 
     def _settled(self, base: Base) -> Base:
         """The base model of a robot whose step is chosen."""
         base = self._frozen(self._within_range(base))
         # What is asked about as a cause comes first: it would not be seen afterwards.
-        return without_step(self.fitting, self.noise, base)
+        return self._without_step(base)
 
     def _within_range(self, base: Base) -> Base:
         """The base model with wider ranges for parameters that its fit leaves at a bound."""

@@ -15,7 +15,7 @@ from bench.gap.model.problem import Start
 from bench.gap.model.world import World
 from bench.problem.seeds import rng_for
 from sims.simulated import Simulated
-from sims.system import Effect, Friction
+from sims.system import Effect, Friction, members_of
 
 _HOLDS = ", and holds still what pulls less"
 """What the sentence of Coulomb friction says that is not true of the soft form, which creeps."""
@@ -55,7 +55,7 @@ def with_solver_parameters(world: World, name: str, says: str) -> str:
     """
     robot: Any = world.kind
     effect = type(world.effects[name])
-    members = getattr(effect, "members", ()) or (effect,)
+    members = members_of(effect)
     joints = [joint for joint in robot.robot.joints if joint.single]
     places = [member.coordinate for member in members if member.coordinate is not None]
     dofs = [joints[place].velocity for place in places]
@@ -64,6 +64,25 @@ def with_solver_parameters(world: World, name: str, says: str) -> str:
     sentence, bracket, place = says.partition(" (at ")
     sentence = sentence.removesuffix(_HOLDS)
     return f"{sentence}, in MuJoCo's soft form (solreffriction {text}){bracket}{place}"
+
+
+def is_likelier_soft(models: Models, model: Model, margin: float) -> bool:
+    """Whether a fitted model of a robot in which dry friction acts, as an effect or as a free
+    number, is likelier in MuJoCo's soft form.
+
+    Args:
+        models: with stiff friction; their noise and frozen parameters hold.
+        model: one of them.
+        margin: by which twice the log likelihood has to be larger.
+    """
+    robot: Any = models.world.kind
+    if not has_dry_friction(models.world, model.names) or robot.robot.friction_form == "soft":
+        return False
+    other = models.world.with_kind(soft_kind(models.world.kind))
+    try:
+        return choose_friction_form(models, model, other, margin) is not None
+    finally:
+        other.close()
 
 
 def choose_friction_form(models: Models, model: Model, other: World, margin: float) -> Model | None:

@@ -39,7 +39,7 @@ from sims.robot.quiet import quiet
 from sims.robot.series import is_series
 from sims.robot.tangent import Change
 from sims.simulated import Simulated
-from sims.system import Acting, Input, Sensor
+from sims.system import Acting, Input, Sensor, members_of
 
 SingleArray = NDArray[np.float32]
 
@@ -172,7 +172,7 @@ class MeasuredLinear(Linear):
 
     def _with_loads(self, motion: Motion) -> Motion:
         """Return the motion with the loads that transmissions carry in it."""
-        effects = [e for e in self._simulator.effects for e in (getattr(e, "members", ()) or (e,))]
+        effects = [m for effect in self._simulator.effects for m in members_of(effect)]
         if not any((e.of or e.name) in LOADED for e in effects):
             return motion
         simulator = self._simulator

@@ -7,7 +7,6 @@ are not made again, so that an interrupted table continues where it was. Several
 a table.
 """
 
-import argparse
 import csv
 import os
 import subprocess
@@ -59,19 +58,7 @@ def main(arguments):
 
 
 def _parser():
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.explain_table",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--simgap",
-        type=Path,
-        default=Path(sys.executable).parent / "simgap",
-        help="command of the installation to examine (default: the one of this Python)",
-    )
-    parser.add_argument("--version", help="name of it in the table (default: its commit)")
-    parser.add_argument("--out", type=Path, default=Path("results/explain-table.csv"))
+    parser = explain_command.parser_of("tests.explain_table", __doc__, "results/explain-table.csv")
     parser.add_argument("--only", default="", help="name of a recording, with * and ?")
     parser.add_argument(
         "--shared",
@@ -79,8 +66,6 @@ def _parser():
         default=Path(os.environ.get("SIMGAP_SHARED", SHARED)),
         help="folder with cases/, data/ and robots/ (default: %(default)s)",
     )
-    parser.add_argument("--cpu-limit", type=float, default=explain_command.CPU_LIMIT)
-    parser.add_argument("--fresh", action="store_true", help="explain again with this version")
     return parser
 
 

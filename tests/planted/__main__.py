@@ -8,7 +8,6 @@ items.jsonl of the output folder, so that an interrupted test continues where it
 versions may share a folder; tables at the end compare them.
 """
 
-import argparse
 import json
 import shutil
 import sys
@@ -49,29 +48,10 @@ def main(arguments):
 
 
 def _parser():
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.planted",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--simgap",
-        type=Path,
-        default=Path(sys.executable).parent / "simgap",
-        help="command of the installation to examine (default: the one of this Python)",
-    )
-    parser.add_argument("--version", help="name of it in the tables (default: its commit)")
-    parser.add_argument("--out", type=Path, default=Path("results/planted"))
+    parser = explain_command.parser_of("tests.planted", __doc__, "results/planted")
     parser.add_argument("--count", type=int, help="the first N items (a fair sample)")
     parser.add_argument("--only", default="", help="ROBOT/KIND/DRAW, with * and ?")
     parser.add_argument("--jobs", type=int, default=1, help="calls at once")
-    parser.add_argument(
-        "--cpu-limit",
-        type=float,
-        default=explain_command.CPU_LIMIT,
-        help="processor seconds of one call (default: %(default)s)",
-    )
-    parser.add_argument("--fresh", action="store_true", help="answer again with this version")
     parser.add_argument("--keep", action="store_true", help="keep recordings and answers in --out")
     return parser
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass
@@ -45,6 +47,37 @@ class Outcome:
 
     def json(self):
         return asdict(self) | {"output": "", "message": self.message}
+
+
+def parser_of(program, description, out):
+    """Return a parser with the options that programs have in common which examine an installation.
+
+    Args:
+        program: module that is run, as in ``python -m PROGRAM``.
+        description: text of its help.
+        out: default of ``--out``.
+    """
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {program}",
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--simgap",
+        type=Path,
+        default=Path(sys.executable).parent / "simgap",
+        help="command of the installation to examine (default: the one of this Python)",
+    )
+    parser.add_argument("--version", help="name of it in the tables (default: its commit)")
+    parser.add_argument("--out", type=Path, default=Path(out))
+    parser.add_argument(
+        "--cpu-limit",
+        type=float,
+        default=CPU_LIMIT,
+        help="processor seconds of one call (default: %(default)s)",
+    )
+    parser.add_argument("--fresh", action="store_true", help="explain again with this version")
+    return parser
 
 
 def explain(simgap, recording, out, cpu_limit=CPU_LIMIT, options=("--jobs", "1")):

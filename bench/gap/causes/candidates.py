@@ -35,7 +35,7 @@ from bench.gap.model.problem import Fit, Start
 from bench.gap.model.time_scale import LASTING, is_instant
 from bench.gap.model.world import World
 from sims.base import Array, Parameter
-from sims.system import FAMILY
+from sims.system import FAMILY, members_of
 
 SMALL = 1e-4
 """Share of a plausible range at which a direction is first taken."""
@@ -112,7 +112,7 @@ def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
         at: the model.
         names: effects, none of which the model has.
     """
-    probes = [probe for name in names for probe in _first(world, at, name)]
+    probes = [probe for name in names for probe in first_probes(world, at, name)]
     values = _responses(world, at, probes)
     acting = _acting(world, probes, values)
     # Only the first answers say which coefficients modify, and only of effects that act at all.
@@ -129,7 +129,7 @@ def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
     return Directions(tuple(probes), np.moveaxis(values, 0, -1))
 
 
-def _first(world: World, at: Fit, name: str) -> Iterator[Probe]:
+def first_probes(world: World, at: Fit, name: str) -> Iterator[Probe]:
     """Every coefficient that scales an effect, at every shape, a little of it each."""
     parameters = parameters_of(world, name)
     # A coefficient that cannot be zero does not scale: it says where or how the others act.
@@ -175,7 +175,7 @@ def _first(world: World, at: Fit, name: str) -> Iterator[Probe]:
 def _stood_for(world: World, at: Fit, name: str) -> bool:
     """Whether the model has an effect that this one contains, by itself or in a family."""
     effects = [world.effects[own] for own in at.effects]
-    there = {m.name for effect in effects for m in getattr(effect, "members", ()) or (effect,)}
+    there = {m.name for effect in effects for m in members_of(effect)}
     return bool(there & set(world.effects[name].contains))
 
 

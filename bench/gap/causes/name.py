@@ -95,19 +95,10 @@ class Inquiry:
         Raises:
             EndedError: the search has to end before.
         """
-        search = self._search
-        # A base model that is not fitted to its end says nothing, of motion neither.
-        if self._watch.left():
-            raise EndedError
-        # Without motion nothing is asked further: any test of such residuals is one of rounding.
-        if shows_nothing(search):
-            return without_motion(search)
-        base = search.base
-        vague = unfixed(search, base)
-        # The same goes for a base that is not fixed: causes would stand for values of it.
-        if vague:
-            left = remains(search, base)
-            return Finding(verdict_of(State(fixed=False)), base, base, (), left, vague)
+        unfit = self.unfit_base()
+        if unfit is not None:
+            return unfit
+        search, base = self._search, self._search.base
         self._watch.begin("search")
         self._model = sought(search)
         self._watch.begin("rivals")
@@ -136,6 +127,28 @@ class Inquiry:
         )
         # The base is the one that was asked first, whatever better fit of it the search came upon.
         return self._finding(verdict_of(state), base, model, causes, left)
+
+    def unfit_base(self) -> Finding | None:
+        """Return the finding where nothing moves, or where the data do not fix the base model; None
+        where causes can be asked for.
+
+        Raises:
+            EndedError: the search had to end before the base model was fitted.
+        """
+        search = self._search
+        # A base model that is not fitted to its end says nothing, of motion neither.
+        if self._watch.left():
+            raise EndedError
+        # Without motion any test of the residuals is one of rounding.
+        if shows_nothing(search):
+            return _without_motion(search)
+        base = search.base
+        vague = unfixed(search, base)
+        # Causes would stand for values of parameters that the data do not fix.
+        if vague:
+            left = remains(search, base)
+            return Finding(verdict_of(State(fixed=False)), base, base, (), left, vague)
+        return None
 
     def _try(self) -> None:
         """Ask the held-out runs."""
@@ -201,7 +214,7 @@ def shows_nothing(search: Search) -> bool:
     return rules.shows_nothing(ranges, left, search.noise.sigma, touched)
 
 
-def without_motion(search: Search) -> Finding:
+def _without_motion(search: Search) -> Finding:
     """Return the finding about a recording in which nothing moves."""
     base, world = search.base, search.world
     # Nothing can be known of any of them, and no test of what is left would mean anything.

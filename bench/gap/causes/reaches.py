@@ -13,7 +13,7 @@ from bench.gap.model.time_scale import is_instant
 from bench.gap.model.tracks import Track
 from bench.gap.model.world import World
 from sims.base import Array, Parameter
-from sims.system import Effect
+from sims.system import Effect, members_of
 
 HARDER = (0.3, 1.0, 3.0)
 """Times as hard as a stop that scores well, of those that a fit may begin with."""
@@ -37,7 +37,7 @@ def parameters_of(world: World, name: str) -> Sequence[Parameter]:
 def reach(world: World, name: str) -> Array:
     """(k,) of each place where an effect limits something, what is reached there."""
     effect = world.effects[name]
-    members = getattr(effect, "members", ()) or (effect,)
+    members = members_of(effect)
     of = effect.coefficients[0].of
     if of == "give":
         # What shapes it stands behind.

@@ -77,7 +77,7 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
     # to simulate a start costs far less than to fit it, so the field is thinned first
     world.watch.tell(f"base fit from {len(starts)} starts")
     if len(starts) > KEPT:
-        order = np.argsort(_costs(world, noise, starts), kind="stable")
+        order = np.argsort(costs_of_starts(world, noise, starts), kind="stable")
         starts = [starts[i] for i in order[:KEPT]]
 
     fits: list[Fit] = []
@@ -111,8 +111,6 @@ def without_step(world: World, noise: Noise, base: Base) -> Base:
     # loaded where there is a robot alone
     from bench.gap.model.tangents import correct
 
-    if world.followed is not None and not world.followed.shows_step_errors():
-        return base
     correct(world, noise, base.fit.theta, base.fit.states)
     if world.correction is None:
         return base
@@ -152,17 +150,25 @@ def misfit_of_starts(world: World, noise: Noise, share: float) -> float:
     share of each run; infinite where none of them can be simulated.
     """
     starts = [Start((), theta, world.guess) for theta in _starts(world, None)]
-    return float(_costs(world, noise, starts, share, np.inf).min())
+    return float(costs_of_starts(world, noise, starts, share, np.inf).min())
 
 
-def _costs(
+def costs_of_starts(
     world: World,
     noise: Noise,
     starts: Sequence[Start],
     share: float = HORIZONS[0].share,
     lost: float = LOST,
 ) -> Array:
-    """Sums of squares of each start over the first samples of the runs."""
+    """Return the sums of squares of each start over the first samples of the runs.
+
+    Args:
+        world: the runs.
+        noise: weighs the channels.
+        starts: parameters and initial states.
+        share: only this first share of each run counts.
+        lost: residual of a sample that could not be simulated.
+    """
     count, runs = len(starts), len(world.tracks)
     thetas = [s.theta for s in starts]
     theta = np.repeat(thetas, runs, axis=0)

@@ -23,7 +23,7 @@ from sims.base import Array, InputError, Parameter, Scenario, unknown
 from sims.engines import HIDING
 from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
-from sims.system import Effect, Input, Sensor
+from sims.system import Effect, Input, Sensor, members_of
 
 Indices = NDArray[np.intp]
 
@@ -401,6 +401,31 @@ class World:
         other.crew = self.crew
         return other
 
+    def with_kind(self, kind: type[Simulated]) -> World:
+        """Return a world of the same runs and parameters with another simulator of the same
+        system.
+        """
+        other = World(
+            kind,
+            self.recording,
+            self.runs,
+            engine=self.engine,
+            extra=self.extra,
+            free=[p.name for p in self.freed],
+            candidates=self.library,
+        )
+        other.parameters = self.parameters
+        other.watch, other.crew = self.watch, self.crew
+        other.followed, other.guess = self.followed, self.guess
+        other.derivatives = self.derivatives
+        self.crew.join(other)
+        return other
+
+    def simulator_of(self, kind: type[Simulated]) -> Simulated:
+        """Return another simulator of the same system with the same effects and channels."""
+        effects: list[str | type[Effect]] = [*self.library, *self.extra]
+        return kind(self.recording.constants, self.channels, effects=effects)
+
     def kinds(self, theta: Array) -> Indices:
         """(L,) which lanes of parameters (L, P) can be simulated together: those of one number."""
         active = theta != 0
@@ -515,7 +540,7 @@ class World:
 
 def _shows(effect: type[Effect], recorded: set[str]) -> bool:
     """Whether the signals that an effect acts on are there; all of them, if it is a family."""
-    members = getattr(effect, "members", ()) or (effect,)
+    members = members_of(effect)
     return all(not member.signal or member.signal in recorded for member in members)
 
 

@@ -16,6 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,7 +37,7 @@ from bench.gap.prediction_error.state_estimation import (
     with_coloured_noise,
 )
 from sims.base import Array
-from sims.robot.measured import IntervalMaps, MeasuredLinear, SingleArray, Trajectory
+from sims.robot.measured import MeasuredLinear, SingleArray, Trajectory
 from sims.robot.scales import floating_forces, scales
 from sims.robot.simulator import RobotSimulator
 from sims.system import Effect
@@ -59,8 +61,6 @@ CORRELATIONS = (0.4, 0.6, 0.75, 0.85, 0.92, 0.96)
 """Correlations of AR(1) sensor noise that are tried one after another while they gain."""
 COLOURED = 5.0
 """Log likelihood that a larger correlation must gain."""
-SHOWN = 7.0
-"""Twice the log likelihood that the errors of the integrator's steps must gain."""
 UNSOUND = 100.0
 """Mean square of the whitened innovations above which a linear model does not follow the runs."""
 SIDE_BY_SIDE = 256
@@ -154,6 +154,9 @@ class FollowedRuns:
             simulator: in place of that of the world.
             force: (E,) missing forces with which the fit of the process noise begins.
         """
+        assert isinstance(world.simulator, RobotSimulator)
+        robot = world.simulator.robot
+        typical = np.concatenate([scales(robot).force, floating_forces(robot)])
         again = RELINEARISED if trajectories is None else 1
         found: FollowedRuns | None = None
         linear: list[MeasuredLinear] = []
@@ -173,57 +176,50 @@ class FollowedRuns:
                 for run, near in enumerate(nearby)
             ]
             maps = [one.interval_maps() for one in linear]
-            found = cls._filtered(world, theta, noise, linear, maps, force)
+            prior = _prior(world, linear, maps[0].states.shape[1])
+            runs = LinearRuns.stacked(maps, world.observed, prior)
+            begin = FIRST_FORCE * typical if force is None else force
+            fitted = _fit_noise(runs, noise, begin, typical)
+            found = cls(world, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
             force, noise = found.force, found.noise
-            trajectories = found.trajectories()
+            trajectories = found.trajectories
         assert found is not None
         return found
 
     @classmethod
-    def _filtered(
-        cls,
-        world: World,
-        theta: Array,
-        noise: Noise,
-        linear: list[MeasuredLinear],
-        maps: list[IntervalMaps],
-        force: Array | None,
-    ) -> FollowedRuns:
+    def of_model(cls, world: World, theta: Array, noise: Noise) -> FollowedRuns:
+        """Return the filter that the world keeps, where it is of this model; else a new one, which
+        the world keeps then.
+        """
+        known: FollowedRuns | None = world.followed
+        if known is not None and known.world is world and np.array_equal(known.theta, theta):
+            return known
+        world.watch.stage("following the runs with the model", 1)
         assert isinstance(world.simulator, RobotSimulator)
-        size = maps[0].states.shape[1]
-        robot = world.simulator.robot
-        typical = np.concatenate([scales(robot).force, floating_forces(robot)])
-        runs = LinearRuns.stacked(maps, world.observed, _prior(world, linear, size))
-        begin = FIRST_FORCE * typical if force is None else force
-        begun = cls(world, theta, noise, linear, runs, begin, _NONE, _NOTHING, typical)
-        return begun.refitted(runs)
+        # Of other steps the motion is not known at the ends of these.
+        alike = known is not None and known.step == world.simulator.step
+        motion = known.trajectories if known is not None and alike else None
+        followed = world.followed = cls.follow(world, theta, noise, motion)
+        return followed
 
     def refitted(self, runs: LinearRuns) -> FollowedRuns:
         """Return the filter of changed linear models, with the process noise and the correlation
         of the sensor noise fitted again.
         """
-        coloured, white = with_coloured_noise(runs, self.noise)
-        force, filtered, smoothed = fit_process_noise(coloured, self.force, white, self.typical)
-        noise, best = self.noise, float(filtered.log_likelihood.sum())
-        for phi in CORRELATIONS:
-            if phi <= float(noise.phi.max(initial=0.0)):
-                continue
-            other = Noise(noise.sigma, np.full_like(noise.phi, phi))
-            coloured, white = with_coloured_noise(runs, other)
-            found = filter_runs(coloured, force, white)
-            likelihood = float(found.log_likelihood.sum())
-            if likelihood < best + COLOURED:
-                break
-            force, filtered, smoothed = fit_process_noise(coloured, force, white, self.typical)
-            noise, best = other, float(filtered.log_likelihood.sum())
         return replace(
-            self, runs=runs, noise=noise, force=force, filtered=filtered, smoothed=smoothed
+            self, runs=runs, **_fit_noise(runs, self.noise, self.force, self.typical)._asdict()
         )
 
-    def needs_process_noise(self) -> Array:
-        """Return by how much twice the log likelihood falls without each missing force, (E,)."""
+    @property
+    def log_likelihood(self) -> float:
+        """Log likelihood of the innovations of all runs."""
+        return float(self.filtered.log_likelihood.sum())
+
+    @cached_property
+    def losses_without_force(self) -> Array:
+        """(E,) by how much twice the log likelihood falls without each missing force."""
         coloured, white = with_coloured_noise(self.runs, self.noise)
-        best = float(self.filtered.log_likelihood.sum())
+        best = self.log_likelihood
         losses = []
         for j in range(self.force.size):
             force = self.force.copy()
@@ -237,8 +233,9 @@ class FollowedRuns:
         """Seconds of a step of the simulator."""
         return float(self.linear[0].step)
 
+    @cached_property
     def trajectories(self) -> list[Trajectory]:
-        """Return the smoothed motion of each run."""
+        """Smoothed motion of each run."""
         size = self.runs.prior.size
         found = []
         for run, linear in enumerate(self.linear):
@@ -282,17 +279,6 @@ class FollowedRuns:
         sizes = np.array([1.0 if p.fixed else p.c[p.place] for p in probes])
         return Columns(tuple(probes), np.array(places, dtype=np.intp), sizes, pushed, readings)
 
-    def shows_step_errors(self) -> bool:
-        """Whether the innovations show the errors of the integrator's steps, as they do where the
-        recorded motion is that of continuous time, and not where the engine itself made it.
-        """
-        response = self.step_error_response().astype(np.float64)
-        power = float(np.square(response).sum())
-        if not power > 0:
-            return False
-        share = float((response * self.filtered.whitened).sum()) / power
-        return share > 0.5 and share * share * power > SHOWN
-
     def step_error_response(self) -> Array:
         """Return the whitened response (R, T, C) to the errors of the integrator's steps."""
         missed = self.runs.step_errors[..., None].astype(np.float32)
@@ -320,7 +306,7 @@ class FollowedRuns:
         number, samples, channels = self.runs.residuals.shape
         size, count = self.runs.prior.size, len(self.world.states)
         joints = len(self.linear[0].trajectory.x[0])
-        own = np.concatenate([np.arange(joints), size_of_positions(self) + np.arange(joints)])
+        own = np.concatenate([np.arange(joints), self.linear[0].positions + np.arange(joints)])
         result = np.zeros((number, samples, channels, count))
         s = np.zeros((number, size, own.size))
         s[:, own, np.arange(own.size)] = 1.0
@@ -332,14 +318,10 @@ class FollowedRuns:
         result[~(np.abs(result) < LARGEST)] = 0.0
         return result
 
-    def output_sensitivities(self, probes: Sequence[Probe]) -> Array:
-        """Return what candidates change about the readings of simulated runs (R, T, C, K), by (1)
-        without gain.
-        """
-        return self.sensitivities(self.columns(probes))
-
     def sensitivities(self, columns: Columns) -> Array:
-        """Return the same of columns that are known."""
+        """Return what candidates change about the readings of simulated runs (R, T, C, K), by (1)
+        without gain, in units of the probes' coefficients.
+        """
         number, samples, channels, count = columns.readings.shape
         size = self.runs.prior.size
         result = np.zeros((number, samples, channels, count))
@@ -375,7 +357,7 @@ class FollowedRuns:
         linear model, and smoothed ones of other joints.
         """
         found = []
-        for run, trajectory in enumerate(self.trajectories()):
+        for run, trajectory in enumerate(self.trajectories):
             first = int(self.linear[run].knots[0])
             x, v = trajectory.x[first].copy(), trajectory.v[first].copy()
             for joint, states in measured_states(self.world, self.noise.sigma, run).items():
@@ -419,14 +401,40 @@ class FollowedRuns:
         return result
 
 
-_NONE = Filtered(*(np.zeros(0) for _ in range(6)))
-_NOTHING = Smoothed(*(np.zeros(0) for _ in range(3)))
-"""Stand for what has not been computed yet."""
+class _NoiseFit(NamedTuple):
+    """Noise of the sensors, standard deviations of the missing forces (E,), and what filter and
+    smoother give with them.
+    """
+
+    noise: Noise
+    force: Array
+    filtered: Filtered
+    smoothed: Smoothed
 
 
-def size_of_positions(followed: FollowedRuns) -> int:
-    """Return the number of positions in the states, those of joints in series included."""
-    return int(followed.linear[0].positions)
+def _fit_noise(runs: LinearRuns, noise: Noise, force: Array, typical: Array) -> _NoiseFit:
+    """Fit the process noise and the correlation of the sensor noise by maximum likelihood.
+
+    Args:
+        runs: the linear models.
+        noise: of the sensors; larger correlations than these are tried.
+        force: (E,) standard deviations of the missing forces with which the fit begins.
+        typical: (E,) typical forces.
+    """
+    best: _NoiseFit | None = None
+    lowest = float(noise.phi.max(initial=0.0))
+    for phi in (None, *(phi for phi in CORRELATIONS if phi > lowest)):
+        tried = noise if phi is None else Noise(noise.sigma, np.full_like(noise.phi, phi))
+        coloured, white = with_coloured_noise(runs, tried)
+        if best is not None:
+            found = filter_runs(coloured, best.force, white)
+            gained = float(found.log_likelihood.sum() - best.filtered.log_likelihood.sum())
+            if gained < COLOURED:
+                break
+            force = best.force
+        best = _NoiseFit(tried, *fit_process_noise(coloured, force, white, typical))
+    assert best is not None
+    return best
 
 
 def _linearised(

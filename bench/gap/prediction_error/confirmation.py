@@ -11,17 +11,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scipy.special import chdtrc
-
 from bench.gap.causes.alternatives import Alternatives
-from bench.gap.causes.name import Finding, Inquiry, closed, shows_nothing, unfixed, without_motion
+from bench.gap.causes.name import Finding, Inquiry, closed
 from bench.gap.causes.rules import State, is_unexplained, verdict_of
 from bench.gap.causes.structure import remains
 from bench.gap.causes.trial import Trial
 from bench.gap.held_out import Validation
 from bench.gap.model.models import Model
-from bench.gap.model.watch import EndedError
+from bench.gap.prediction_error.null_distribution import p_value_of_gain
 from bench.gap.prediction_error.search import PredictionErrorSearch
+
+MIMICRY = 0.5
+"""Effects that close a smaller share of the gap are not told where the cause is unknown."""
+NEAR = 15.0
+"""Rivals this near in twice the log likelihood are measured on held-out runs."""
 
 
 class Confirmation(Inquiry):
@@ -43,20 +46,14 @@ class Confirmation(Inquiry):
             EndedError: the search has to end before.
         """
         search, watch = self._robot, self._watch
-        if watch.left():
-            raise EndedError
-        if shows_nothing(search):
-            return without_motion(search)
+        unfit = self.unfit_base()
+        if unfit is not None:
+            return unfit
         base = search.base
-        vague = unfixed(search, base)
-        # Causes would stand for values of parameters that the data do not fix.
-        if vague:
-            left = remains(search, base)
-            return Finding(verdict_of(State(fixed=False)), base, base, (), left, vague)
         watch.begin("search")
         self._model = search.run()
         watch.begin("rivals")
-        self._model = search.with_rivals(self._model)
+        self._model = search.fit_rivals(self._model)
         self._measure()
         watch.begin("structure")
         self._model = search.to_the_end(self._model)
@@ -69,7 +66,7 @@ class Confirmation(Inquiry):
             causes=len(causes),
             alternatives=any(cause.alternatives for cause in causes),
             closed=closed(search, model, left),
-            unexplained=is_unexplained(left.structure, search.lacks(model)),
+            unexplained=is_unexplained(left.structure, search.p_value_of_missing_effect(model)),
             missed=trial is not None and trial.misses(model, left),
         )
         verdict = verdict_of(state)
@@ -96,17 +93,10 @@ class Confirmation(Inquiry):
         self._model = trial.without_idle(search, model)
 
 
-MIMICRY = 0.5
-"""Effects that close a smaller share of the gap are not told where the cause is unknown."""
-NEAR = 15.0
-"""Rivals this near in twice the log likelihood are measured on held-out runs."""
-
-
 @dataclass(frozen=True)
 class _RobotAlternatives(Alternatives):
     """Collects alternatives of a robot's effects; p-values by the chi squared distribution."""
 
     def _p_value(self, rest: Model, effect: str, gain: float) -> float:  # noqa: ARG002
         slot = self.search.world.slots[effect]
-        candidates = len(self.search.world.library)
-        return float(min(candidates * chdtrc(slot.stop - slot.start, max(gain, 0.0)), 1.0))
+        return p_value_of_gain(gain, slot.stop - slot.start, len(self.search.world.library))

@@ -1,11 +1,10 @@
-"""Find the effects that a robot's model lacks: filter, respond, select, and filter again.
+"""Select the effects that a robot's model lacks, with the process noise fitted in between.
 
     1. Follow the runs with the model by a Kalman filter about the measured motion.
     2. Compute the response of the innovations to every candidate effect.
     3. Select effects by regression, whatever their number.
     4. Put them into the linear model, fit the process noise again, and go on at 3, since with less
        process noise the innovations show more.
-    5. While process noise is still needed, offer effects with more shapes as well.
 
 (L. Ljung, System Identification, 2nd ed., 1999, chapters 3, 7 and 16.)
 """
@@ -56,6 +55,13 @@ class Selected:
         return [group.effect for group in self.groups]
 
 
+def shows_step_errors(followed: FollowedRuns) -> bool:
+    """Whether the innovations show the errors of the integrator's steps, as they do where the
+    recorded motion is that of continuous time, and not where the engine itself made it.
+    """
+    return regress(followed, followed.columns([])).shows_nuisance([])
+
+
 def identify(followed: FollowedRuns, columns: Columns, most: int = MOST) -> Selected:
     """Select effects, with the process noise fitted again after each selection.
 
@@ -75,7 +81,7 @@ def identify(followed: FollowedRuns, columns: Columns, most: int = MOST) -> Sele
         _, found = regression.solve(selected)
         numerics = regression.nuisance(selected)
         now = with_effects(followed, columns, selected, found, numerics)
-        likelihood = float(now.filtered.log_likelihood.sum())
+        likelihood = now.log_likelihood
         done = result is not None and likelihood < result.log_likelihood + 1.0
         if result is None or likelihood > result.log_likelihood:
             result = Selected(
@@ -120,9 +126,9 @@ def regress(
     grams = np.zeros((number, count + 1, count + 1))
     crosses, totals = np.zeros((number, count + 1)), np.zeros(number)
     for run in range(number):
-        rows = responses[run].reshape(-1, count).astype(np.float64)
-        rows = np.concatenate([rows, nuisance[run].reshape(-1, 1)], axis=1)
         target = now.filtered.whitened[run].reshape(-1)
+        rows = responses[run].reshape(target.size, count).astype(np.float64)
+        rows = np.concatenate([rows, nuisance[run].reshape(-1, 1)], axis=1)
         target = target + rows[:, own] @ weights + numerics * rows[:, -1]
         grams[run] = rows.T @ rows
         crosses[run] = rows.T @ target

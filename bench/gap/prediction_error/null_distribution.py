@@ -21,6 +21,17 @@ DRAWS = 200
 """Number of draws from the null distribution."""
 
 
+def p_value_of_gain(gain: float, coefficients: int, candidates: int) -> float:
+    """Return the probability that the best of some candidates gains so much by chance.
+
+    Args:
+        gain: twice the log likelihood.
+        coefficients: number of coefficients of each candidate.
+        candidates: number of candidates.
+    """
+    return min(candidates * float(chdtrc(coefficients, max(gain, 0.0))), 1.0)
+
+
 def null_scores(
     regression: Regression, lacking: Collection[str], rng: np.random.Generator
 ) -> Scores:
@@ -46,7 +57,7 @@ def null_scores(
         chance.append(float(chdtri(freedom, 1.0 - LUCK ** (1.0 / shapes))))
         uniform = rng.random(DRAWS) ** (1.0 / shapes)
         drawn.append(chdtri(freedom, 1.0 - uniform))
-        p_values.append(min(shapes * float(chdtrc(freedom, best)), 1.0))
+        p_values.append(p_value_of_gain(best, freedom, shapes))
         peak: Group = regression.groups[max(own, key=lambda i: gains[i])]
         peaks.append(((peak, regression.solve([peak])[1][0]),))
     order = np.argsort(-score, kind="stable")

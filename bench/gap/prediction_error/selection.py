@@ -21,10 +21,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.gap.causes.candidates import Probe
 from bench.gap.causes.gains import Group, batches, explained
 from sims.base import Array
+
+Places = NDArray[np.intp]
 
 ALIASED = 1e-7
 """Share of a column's sum of squares that other columns leave, below which it is one of them."""
@@ -36,19 +39,6 @@ RIDGE = 1e-10
 """Ridge, as a share of each column's sum of squares."""
 SMALLEST_RSS = 1e-9
 """Smallest residual sum of squares, as a share of the innovations'."""
-
-
-@dataclass(frozen=True)
-class Term:
-    """One effect of a set: a group of columns, such as a law at one of its shapes.
-
-    Attributes:
-        group: its columns.
-        coefficients: of each column, in units of the columns.
-    """
-
-    group: Group
-    coefficients: Array
 
 
 @dataclass
@@ -131,9 +121,7 @@ class Regression:
         solution = np.zeros(columns.size)
         while active.any():
             own = columns[active]
-            scale = np.sqrt(np.maximum(np.diagonal(gram)[own], 1e-300))
-            normal = gram[np.ix_(own, own)] / scale / scale[:, None]
-            normal[np.diag_indices_from(normal)] += RIDGE
+            normal, scale = _normalised(gram, own)
             solved = np.linalg.solve(normal, cross[own] / scale)
             solution[:] = 0.0
             solution[active] = solved / scale
@@ -167,9 +155,7 @@ class Regression:
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
         gram, cross, rss = self.gram, self.cross, self.total
         if columns.size:
-            scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 1e-300))
-            normal = gram[np.ix_(columns, columns)] / scale / scale[:, None]
-            normal[np.diag_indices_from(normal)] += RIDGE
+            normal, scale = _normalised(gram, columns)
             rows = gram[columns] / scale[:, None]
             solved = np.linalg.solve(normal, np.c_[rows, cross[columns] / scale])
             gram = gram - rows.T @ solved[:, :-1]
@@ -256,6 +242,16 @@ class Regression:
                 break
             del left[least]
         return left
+
+
+def _normalised(gram: Array, columns: Places) -> tuple[Array, Array]:
+    """Return the normal matrix of some columns, scaled to a diagonal of one plus the ridge, and the
+    lengths of these columns.
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 1e-300))
+    normal = gram[np.ix_(columns, columns)] / scale / scale[:, None]
+    normal[np.diag_indices_from(normal)] += RIDGE
+    return normal, scale
 
 
 def groups_of(probes: Sequence[Probe]) -> list[Group]:
