@@ -179,22 +179,16 @@ class PredictionErrorSearch(Search):
             or self._must_end
         ):
             return best
-        theta = self.base.fit.theta
-        tried = [
-            (*self._follow_with(start, [name], turns=0), name)
-            for name, start in self._propose_effects(self.follow(), theta, [])
-        ]
-        if not tried:
+        tried = self._try_one_more(self.follow(), self.base.fit.theta, [])
+        if tried is None:
             return best
-        first = max(tried, key=lambda one: 2.0 * one[2] - self._penalty(one[3]))
-        name = first[3]
-        theta, followed, likelihood = self._follow_with(first[0], [name])
+        theta, followed, likelihood, name = tried
         own = self._followed_by(best).log_likelihood
         price = sum(self._penalty(one) for one in best.names) - self._penalty(name)
         if 2.0 * (own - likelihood) > price + RIVAL_MARGIN:
             return best
         single = self._fit(Start((name,), theta, self._first_states(followed)))
-        return self._of_higher_merit(single, best)
+        return self._of_higher_merit(self.fit_rivals(single), best)
 
     @staticmethod
     def _of_higher_merit(one: Model, other: Model) -> Model:
@@ -306,24 +300,14 @@ class PredictionErrorSearch(Search):
             for name in names:
                 theta[self.world.slots[name]] = own[self.world.slots[name]]
             theta, followed, likelihood = self._follow_with(theta, names)
-        watch = self.world.watch
         for _ in range(MAX_STEPS):
-            watch.stage("testing effects in the model one by one", MAX_TRIALS)
-            tried = []
-            for name, start in self._propose_effects(followed, theta, names):
-                tried.append((*self._follow_with(start, [*names, name], turns=0), name))
-                watch.advance()
-                watch.check()
-            if not tried:
+            tried = self._try_one_more(followed, theta, names)
+            if tried is None:
                 break
-            # The coefficients of the best two are improved before they are compared.
-            tried.sort(key=lambda one: self._penalty(one[3]) - 2.0 * one[2])
-            tried = [(*self._follow_with(one[0], [*names, one[3]]), one[3]) for one in tried[:2]]
-            best = max(tried, key=lambda one: 2.0 * one[2] - self._penalty(one[3]))
-            name = best[3]
-            if 2.0 * (best[2] - likelihood) < self._penalty(name):
+            name = tried[3]
+            if 2.0 * (tried[2] - likelihood) < self._penalty(name):
                 break
-            theta, followed, likelihood, _ = best
+            theta, followed, likelihood, _ = tried
             contained = self.world.effects[name].contains
             names = [n for n in names if n not in contained] + [name]
             if not (followed.losses_without_force > MIN_LOSS_WITHOUT_FORCE).any():
@@ -332,6 +316,23 @@ class PredictionErrorSearch(Search):
             return self.base
         fitted = self._fit(Start(tuple(names), theta, self._first_states(followed)))
         return self._without_idle_effects(fitted) if np.isfinite(fitted.fit.cost) else self.base
+
+    def _try_one_more(
+        self, followed: FollowedRuns, theta: Array, names: Sequence[str]
+    ) -> tuple[Array, FollowedRuns, float, str] | None:
+        """Follow the runs with each effect that gains most in addition to the model, and return the
+        likeliest: its parameters, filter, log likelihood and name. None where no effect gains.
+        """
+        watch, tried = self.world.watch, []
+        watch.stage("testing effects in the model one by one", MAX_TRIALS)
+        for name, start in self._propose_effects(followed, theta, names):
+            tried.append((*self._follow_with(start, [*names, name], turns=0), name))
+            watch.advance()
+            watch.check()
+        # The coefficients of the best two are improved before they are compared.
+        tried.sort(key=lambda one: self._penalty(one[3]) - 2.0 * one[2])
+        tried = [(*self._follow_with(one[0], [*names, one[3]]), one[3]) for one in tried[:2]]
+        return max(tried, key=lambda one: 2.0 * one[2] - self._penalty(one[3]), default=None)
 
     def _without_idle_effects(self, model: Model) -> Model:
         """Remove effects that do not pay, and replace a family by a member that does as well."""

@@ -1,4 +1,7 @@
-"""A model file of a two-link arm with position servos, for logs that tests make."""
+"""A model file of a two-link arm with position servos, for logs that tests make.
+
+No motion in the tests of `steps` reaches the range of the shoulder, so it must change no answer.
+"""
 
 ARM = """<mujoco>
   <compiler angle="radian" autolimits="true"/>
@@ -6,7 +9,7 @@ ARM = """<mujoco>
   <worldbody>
     <body name="upper">
       <inertial pos="0 0 -0.2" mass="1.2" diaginertia="0.02 0.02 0.002"/>
-      <joint name="shoulder" axis="0 1 0" damping="0.3"/>
+      <joint name="shoulder" axis="0 1 0" damping="0.3" range="-2.6 2.6"/>
       <body name="fore" pos="0 0 -0.4">
         <inertial pos="0 0 -0.1" mass="0.8" diaginertia="0.01 0.01 0.001"/>
         <joint name="elbow" axis="0 1 0" damping="0.1"/>

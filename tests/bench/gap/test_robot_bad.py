@@ -7,12 +7,8 @@ from bench.gap.explain import explain
 from bench.recordings.inspection import load
 from bench.recordings.stamps import refuse_odd
 from sims.base import InputError, Scenario
-from tests.bench.gap import arm_model
+from tests.bench.gap.arm_model import ARM
 
-ARM = arm_model.ARM.replace(
-    '"shoulder" axis="0 1 0" damping="0.3"',
-    '"shoulder" axis="0 1 0" damping="0.3" range="-2.6 2.6"',
-)
 COLUMNS = ("u.m_shoulder", "u.m_elbow", "q.shoulder", "q.elbow")
 TOML = 'model = "arm.xml"\n' + "".join(
     f'[{kind}s."{name}"]\nunit = "rad"\n'
