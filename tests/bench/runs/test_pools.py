@@ -163,7 +163,7 @@ def test_no_worker_outlives_its_parent(tmp_path):
     assert not psutil.pid_exists(worker) or psutil.Process(worker).status() == "zombie"
 
 
-def test_memory_beyond_the_limit_is_refused_and_the_limit_ends_with_the_block():
+def allocate_within_and_beyond_the_limit():
     with memory_limit(200):
         held = np.ones(12_500_000)  # 100 MB: within
         with pytest.raises(MemoryError):
@@ -172,6 +172,16 @@ def test_memory_beyond_the_limit_is_refused_and_the_limit_ends_with_the_block():
     assert np.ones(37_500_000).nbytes == 300_000_000
     with memory_limit(0):
         assert np.ones(37_500_000).nbytes == 300_000_000
+
+
+def test_memory_beyond_the_limit_is_refused_and_the_limit_ends_with_the_block():
+    """In a process of its own: one that has freed much memory is given that again, unlimited."""
+    process = multiprocessing.get_context("spawn").Process(
+        target=allocate_within_and_beyond_the_limit
+    )
+    process.start()
+    process.join(60.0)
+    assert process.exitcode == 0
 
 
 def interrupted_at_birth(context):
