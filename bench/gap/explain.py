@@ -5,7 +5,7 @@ steps in order.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from itertools import combinations
@@ -242,6 +242,8 @@ class _Explainer:
         self.free = tuple(free)
         # By name the declared range of a base parameter and the wider one that it was given.
         self.wider: dict[str, tuple[Bounds, Bounds]] = {}
+        # Base parameters of a robot that prediction errors give, where the fit begins.
+        self.identified: Array | None = None
         self._enter(kind)
         left_out = [
             f"{effect} is not tested: {why}" for effect, why in kind.system.left_out.items()
@@ -413,7 +415,7 @@ class _Explainer:
     def _unexplained(self, search: Search, finding: Finding) -> tuple[RecordingFault, ...]:
         """Wrong units and signs of a robot's recording that no effect explains."""
         explained = finding.verdict in ("adequate", "named", "ambiguous")
-        if not self.kind.has_model or self.free_numbers or explained or self.watch.left():
+        if not self._asks_units_late or explained or self.watch.left():
             return ()
         base = Base(search.base.fit, frozenset(search.frozen))
         fault = wrong_units(self._units, self.fitting, self.noise, base)
@@ -475,8 +477,7 @@ class _Explainer:
         if self.kind.has_model:
             self._follow()
         base = fit_base(self.fitting, self.noise, self._given())
-        if self.kind.has_model and not self.free_numbers:
-            # Of a robot units are questioned where no effect explains the gap.
+        if self._asks_units_late:
             return self._prepared(base)
         if not self.watch.left():
             fault = wrong_units(self._units, self.fitting, self.noise, base)
@@ -484,6 +485,13 @@ class _Explainer:
         if self.faults:
             return base
         return self._prepared(base) if self.kind.has_model else self._within_range(base)
+
+    @property
+    def _asks_units_late(self) -> bool:
+        """Whether units are questioned where no effect explains the gap, as those of a robot's
+        recording whose free numbers could be identified.
+        """
+        return self.kind.has_model and not (self.free_numbers and self.identified is None)
 
     @property
     def free_numbers(self) -> bool:
@@ -500,9 +508,34 @@ class _Explainer:
             self.watch.stage("following the runs with the model")
             followed.append(FollowedRuns.follow(world, world.nominal(), self.noise, None))
         # Where the linear model explodes, causes are searched by simulation.
-        if all(one.is_sound for one in followed):
-            for world, one in zip(self._worlds(), followed, strict=True):
-                world.follow(one)
+        if not all(one.is_sound for one in followed):
+            return
+        if self.free_numbers and self.tuner is None:
+            followed[0] = self._identified(followed[0])
+        for world, one in zip(self._worlds(), followed, strict=True):
+            world.follow(one)
+
+    def _identified(self, followed: FollowedRuns) -> FollowedRuns:
+        """The runs, filtered with base parameters that are identified by prediction errors."""
+        # Loaded where there is a robot alone.
+        from bench.gap.prediction_error.base_parameters import identify_base
+
+        world = self.fitting
+        declared = {p.name: p.bounds for p in world.parameters}
+        found = identify_base(world, self.noise, followed)
+        if found is not followed:
+            self.identified = found.theta[world.base]
+        wider = {p.name: p.bounds for p in world.parameters if p.bounds != declared[p.name]}
+        self._widen(wider, declared)
+        return found
+
+    def _widen(self, found: Mapping[str, Bounds], declared: Mapping[str, Bounds]) -> None:
+        """State the wider ranges of base parameters, and use them for all runs."""
+        for world in self._worlds()[1:]:
+            use_bounds(world, found)
+        for parameter, (low, high) in found.items():
+            self.say(f"{parameter} ends at a bound of its range: widened to {low:g} to {high:g}")
+        self.wider |= {one: (declared[one], bounds) for one, bounds in found.items()}
 
     def _prepared(self, base: Base) -> Base:
         """The base model of a robot with the step that the data ask for, and without free numbers
@@ -546,11 +579,7 @@ class _Explainer:
         declared = {p.name: p.bounds for p in self.fitting.parameters}
         declared |= {name: bounds for name, (bounds, _) in self.wider.items()}
         base, found = fit_wider(self.fitting, self.noise, base)
-        for world in self._worlds()[1:]:
-            use_bounds(world, found)
-        for parameter, (low, high) in found.items():
-            self.say(f"{parameter} ends at a bound of its range: widened to {low:g} to {high:g}")
-        self.wider |= {one: (declared[one], bounds) for one, bounds in found.items()}
+        self._widen(found, declared)
         return base
 
     def _frozen(self, base: Base) -> Base:
@@ -702,9 +731,11 @@ class _Explainer:
         )
 
     def _given(self) -> Array | None:
-        """Where a registered tuner would begin; None without one."""
+        """Base parameters with which a fit begins: those of a registered tuner, or those that are
+        identified by prediction errors; None where there are none.
+        """
         if self.tuner is None:
-            return None
+            return self.identified
         # Loaded here alone: few ask for a tuner, and what drives one is much to load.
         from bench.gap.model.tuner_start import tuned
 

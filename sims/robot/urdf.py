@@ -23,6 +23,8 @@ SEEN = ("material", "visual")
 SINGLE = ("revolute", "continuous", "prismatic")
 MOVING = (*SINGLE, "floating", "planar", "spherical")
 KINDS = ("fixed", *MOVING)
+WORLD = "world"
+"""Name of the link that is the fixed world by a convention of many files."""
 RIGID = (1e-4, 1.0)
 """`solref` of a rigid relation: MuJoCo raises the time constant, in s, to two time steps."""
 
@@ -38,7 +40,7 @@ def mended(files: Files, root: Element) -> list[str]:
     """
     _no_macros(files, root)
     links, joints = _links(files, root), children(root, "joint")
-    notes = [*_unread(root), *_named(files, joints)]
+    notes = [*_with_world(files, root, links, joints), *_unread(root), *_named(files, joints)]
     above = _joined(files, links, joints)
     if not any(joint.get("type") in MOVING for joint in joints):
         raise InputError(f"{files.path}: none of its {len(joints)} joints moves")
@@ -81,6 +83,18 @@ def _links(files: Files, root: Element) -> dict[str, Element]:
             raise files.fault(link, f"two links are called '{cut(name)}'")
         links[name] = link
     return links
+
+
+def _with_world(
+    files: Files, root: Element, links: dict[str, Element], joints: Sequence[Element]
+) -> list[str]:
+    """Add the link `world` where joints hang on it and the file does not state it, as simulators
+    that have a link of this name read it.
+    """
+    if WORLD in links or not any(_end(files, joint, "parent") == WORLD for joint in joints):
+        return []
+    links[WORLD] = SubElement(root, "link", {"name": WORLD})
+    return [f"the link {WORLD}, which the file does not state, is the fixed world"]
 
 
 def _named(files: Files, joints: Sequence[Element]) -> list[str]:

@@ -214,6 +214,7 @@ class Fitter:
             widths=widths,
             steps=np.concatenate([FIRST_STEP * widths, state_steps]),
             exact=self.exact,
+            rough=world.linear,
         )
 
     def _points(self, trials: Sequence[_Trial], seen: Mask) -> list[Point]:
@@ -389,13 +390,14 @@ class Fitter:
     def _judge(self, problem: Problem, point: Point) -> None:
         """Take a trial's point if it is better, and learn from it how much to damp."""
         gained = problem.point.cost - point.cost
+        own = problem.here
         if point.cost < problem.point.cost:
             if self.world.linear:
                 problem.point = replace(point, jacobian=problem.learnt(point))
                 problem.here = not problem.free.size
             else:
                 self._take(problem, point)
-            problem.taken(gained, point.cost)
+            problem.taken(gained, point.cost, own)
         else:
             problem.refused()
 

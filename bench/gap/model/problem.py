@@ -44,6 +44,21 @@ EXACT = 0.002
 a twentieth of what noise makes of them.
 """
 
+ROUGH_SHARE = 1e-3
+"""The share of the sum of squares of a robot's fit, whose cost is rough: a joint that begins to
+stick one step of the integrator later moves by more than the fit could still gain.
+"""
+ROUGH = 3.0
+"""A robot's fit has converged where a step that promised less than this, with derivatives of the
+very point, gains nothing: the cost is rougher than what is left to gain.
+"""
+STAGNANT_RATIO = 0.3
+"""Gain ratio (1) below which a robot's fit is stagnant, where it gains little as well."""
+STAGNANT_SHARE = 5e-3
+"""What is little then, as a share of the sum of squares."""
+ROUGH_EXACT = 1.0
+"""The same of a fit whose numbers are told."""
+
 FIRST_DAMPING = 1e-3
 """Where the λ of (2) begins."""
 LEAST_DAMPING = 1e-10
@@ -150,6 +165,7 @@ class Problem:
         stale: whether they have to be taken anew before it goes on.
         waits: whether that can wait until it is known that it is not far behind.
         exact: whether it goes on until `EXACT`.
+        rough: whether its cost is not smooth at the scale of the noise.
     """
 
     point: Point
@@ -166,10 +182,13 @@ class Problem:
     stale: bool = False
     waits: bool = False
     exact: bool = False
+    rough: bool = False
 
     def enough(self, cost: float) -> float:
         """By less than this a step need not lower the cost."""
-        return EXACT if self.exact else ENOUGH + SHARE * cost
+        if self.exact:
+            return EXACT
+        return ENOUGH + (ROUGH_SHARE if self.rough else SHARE) * cost
 
     def fit(self) -> Fit:
         """What has been fitted by now."""
@@ -219,13 +238,22 @@ class Problem:
         else:
             self.stale = self.waits = True
 
-    def taken(self, gained: float, cost: float) -> None:
-        """After a step that brought the cost down to this."""
+    def taken(self, gained: float, cost: float, own: bool) -> None:
+        """Learn from a step that brought the cost down.
+
+        Args:
+            gained: by how much.
+            cost: to which.
+            own: whether the derivatives were those of the very point where the step began.
+        """
         self.stale = not self.here and abs(gained / max(self.promised, 1e-300) - 1.0) > KEPT
         ratio = gained / max(self.promised, 1e-300)  # (1)
         factor = max(LEAST_FACTOR, 1.0 - (2.0 * ratio - 1.0) ** 3)
         self.damping = max(self.damping * factor, LEAST_DAMPING)  # (2)
         self.growth = GROWTH
+        stagnant = ratio < STAGNANT_RATIO and gained < STAGNANT_SHARE * cost
+        if self.rough and not self.exact and own and stagnant:
+            self.done = True
         # With derivatives of its own it has converged; with others it may have.
         if gained < self.enough(cost):
             self.finish()
@@ -234,6 +262,9 @@ class Problem:
         """After a step that did not, (3), unless its derivatives were to blame."""
         if not self.here:
             self.stale = True
+            return
+        if self.rough and self.promised < (ROUGH_EXACT if self.exact else ROUGH):
+            self.done = True
             return
         self.damping = self.damping * GROWTH * self.growth
         self.growth = GROWTH * self.growth

@@ -67,6 +67,24 @@ def fit_wider(world: World, noise: Noise, base: Base) -> tuple[Base, dict[str, B
     return base, found
 
 
+def range_around(world: World, place: int, value: float | None = None) -> Bounds:
+    """The range of a base parameter, widened until it contains a value or ROUNDS times.
+
+    Args:
+        world: the runs for fitting.
+        place: of the parameter.
+        value: which the range must contain; None for the widest range.
+    """
+    parameter = world.parameters[place]
+    limits = limits_of(world, place)
+    for _ in range(ROUNDS):
+        low, high = parameter.bounds
+        if value is not None and low <= value <= high:
+            break
+        parameter = replace(parameter, bounds=widened(parameter, limits), training=None)
+    return parameter.bounds
+
+
 def use_bounds(world: World, found: Mapping[str, Bounds]) -> None:
     """Let the parameters of a world have these ranges."""
     if not found:

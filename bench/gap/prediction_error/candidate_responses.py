@@ -210,6 +210,20 @@ class FollowedRuns:
             self, runs=runs, **_fit_noise(runs, self.noise, self.force, self.typical)._asdict()
         )
 
+    def whitened_innovations(self, theta: Array) -> Array:
+        """Return the whitened innovations (R, T, C) of a model with parameters nearby, filtered
+        about the same motion with the same process noise.
+        """
+        motion = [linear.trajectory for linear in self.linear]
+        linear = [
+            _linearised(self.world, theta, self.noise, run, motion[run], near)
+            for run, near in enumerate(self.linear)
+        ]
+        maps = [one.interval_maps() for one in linear]
+        runs = LinearRuns.stacked(maps, self.world.observed, self.runs.prior)
+        coloured, white = with_coloured_noise(runs, self.noise)
+        return filter_runs(coloured, self.force, white).whitened
+
     @property
     def log_likelihood(self) -> float:
         """Log likelihood of the innovations of all runs."""

@@ -54,7 +54,12 @@ class Confirmation(Inquiry):
         self._model = search.run()
         watch.begin("rivals")
         self._model = search.fit_rivals(self._model)
+        size = len(self._model.names)
         self._measure()
+        if 0 < len(self._model.names) < size:
+            # What does as well in place of an effect was fitted beside those that are removed.
+            self._model = search.fit_rivals(self._model)
+            self._measure()
         watch.begin("structure")
         self._model = search.to_the_end(self._model)
         left = remains(search, self._model)

@@ -468,14 +468,13 @@ class PredictionErrorSearch(Search):
         """
         key = theta.tobytes()
         known = self._trial_filters.get(key)
-        world, motion = self.world, self.follow().trajectories
-        noise = self.follow().noise
+        world, noise = self.world, self.follow().noise
         best: tuple[Array, FollowedRuns, float] | None = None
         for turn in range(turns + 1):
             force = self.follow().force if best is None else best[1].force
             followed = known if turn == 0 and known is not None else None
             if followed is None:
-                followed = FollowedRuns.follow(world, theta, noise, motion, force=force)
+                followed = FollowedRuns.follow(world, theta, noise, None, force=force)
                 if self._has_moved_far(followed):
                     # With an encoder offset the true motion differs from the readings.
                     own = followed.trajectories
@@ -591,9 +590,7 @@ class PredictionErrorSearch(Search):
         world, followed = self.world, self.follow()
         simulator = world.simulator if kind is world.kind else world.simulator_of(kind)
         assert isinstance(simulator, RobotSimulator)
-        motion = followed.trajectories
-        force = followed.force
-        own = FollowedRuns.follow(world, theta, followed.noise, motion, simulator, force)
+        own = FollowedRuns.follow(world, theta, followed.noise, None, simulator, followed.force)
         return own.log_likelihood
 
     def _plain_theta(self, start: Start) -> Array:
@@ -786,9 +783,8 @@ class PredictionErrorSearch(Search):
             return followed
         key = self._key(model)
         if key not in self._followed:
-            motion, force = followed.trajectories, followed.force
             found = FollowedRuns.follow(
-                self.world, model.fit.theta, followed.noise, motion, force=force
+                self.world, model.fit.theta, followed.noise, None, force=followed.force
             )
             share = self._selected.numerics if self._selected is not None else 0.0
             if share:

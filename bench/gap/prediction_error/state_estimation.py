@@ -36,6 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.gap.model.noise import Noise
+from bench.gap.prediction_error.recursions import filter_recursion, smoother_recursion
 from sims.base import Array
 from sims.robot.measured import IntervalMaps
 
@@ -264,50 +265,20 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     """
     number, samples, channels = runs.residuals.shape
     size = runs.prior.size
-    with np.errstate(all="ignore"):
-        scaled = runs.forces * _completed(force, runs)[..., None, None, :]
-        excited = scaled @ scaled.transpose(0, 1, 3, 2)
     # What is not recorded has a reading of zero with the variance of one.
     variances = np.where(runs.recorded, white, 1.0)
-    noise = np.zeros((number, samples, channels, channels))
-    diagonal = np.arange(channels)
-    noise[:, :, diagonal, diagonal] = variances
-    x = np.zeros((number, size))
-    p = np.tile(np.diag(np.square(runs.prior)), (number, 1, 1))
     predicted = np.zeros((number, samples, size))
     covariances = np.zeros((number, samples, size, size))
     innovations = np.zeros((number, samples, channels))
     gains = np.zeros((number, samples, size, channels))
     whiteners = np.zeros((number, samples, channels, channels))
     likelihood = np.zeros(number)
-    identity = np.eye(channels)
+    filter_recursion(
+        *_contiguous(runs.states, runs.defects, runs.forces, runs.readings, runs.residuals),
+        *(variances, runs.prior, _completed(force, runs), LARGEST_COVARIANCE),
+        *(predicted, covariances, innovations, gains, whiteners, likelihood),
+    )
     # Of a model that explodes nothing is known, and its likelihood is zero.
-    with np.errstate(all="ignore"):
-        for i in range(samples):
-            h = runs.readings[:, i]
-            predicted[:, i], covariances[:, i] = x, p
-            crossed = p @ h.transpose(0, 2, 1)
-            root = np.linalg.cholesky(h @ crossed + noise[:, i])
-            whitener = np.linalg.solve(root, np.broadcast_to(identity, root.shape))
-            half = crossed @ whitener.transpose(0, 2, 1)
-            gain = half @ whitener
-            e = runs.residuals[:, i] - (h @ x[:, :, None])[:, :, 0]
-            w = (whitener @ e[:, :, None])[:, :, 0]
-            likelihood -= np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-            likelihood -= 0.5 * np.square(w).sum(axis=1)
-            innovations[:, i], gains[:, i], whiteners[:, i] = e, gain, whitener
-            if i + 1 == samples:
-                break
-            x = x + (half @ w[:, :, None])[:, :, 0]
-            p = p - half @ half.transpose(0, 2, 1)
-            a = runs.states[:, i]
-            x = (a @ x[:, :, None])[:, :, 0] - runs.defects[:, i]
-            p = a @ p @ a.transpose(0, 2, 1) + excited[:, i]
-            p = 0.5 * (p + p.transpose(0, 2, 1))
-            # Of a motion that is unstable at this rate nothing is known after the step.
-            lost = ~(np.abs(p).max(axis=(1, 2)) < LARGEST_COVARIANCE)
-            if lost.any():
-                p[lost] = np.diag(np.square(runs.prior) + 1.0)
     likelihood = np.nan_to_num(likelihood, nan=-np.inf)
     return Filtered(predicted, covariances, innovations, gains, whiteners, likelihood)
 
@@ -315,38 +286,19 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
 def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
     """Smooth all runs by (5) and (6); arguments as those of `filter_runs`."""
     number, samples, _ = runs.residuals.shape
-    size = runs.prior.size
-    sizes = _completed(force, runs)
-    states = np.zeros((number, samples, size))
     count = runs.forces.shape[3]
+    states = np.zeros((number, samples, runs.prior.size))
     forces = np.zeros((number, samples - 1, count))
-    adjoint = np.zeros((number, size))
-    information = np.zeros((number, size, size))
-    measured = np.zeros(count)
-    expected = np.zeros(count)
-    identity = np.eye(size)
-    with np.errstate(all="ignore"):
-        for i in range(samples - 1, -1, -1):
-            h, w = runs.readings[:, i], filtered.whiteners[:, i]
-            weighed = w @ h
-            closed = identity - filtered.gains[:, i] @ h
-            if i + 1 < samples:
-                back = runs.states[:, i] @ closed
-                adjoint = (back.transpose(0, 2, 1) @ adjoint[:, :, None])[:, :, 0]
-                information = back.transpose(0, 2, 1) @ information @ back
-            white = (w @ filtered.innovations[:, i][:, :, None])[:, :, 0]
-            adjoint = adjoint - (weighed.transpose(0, 2, 1) @ white[:, :, None])[:, :, 0]
-            information = information + weighed.transpose(0, 2, 1) @ weighed
-            moved = (filtered.covariances[:, i] @ adjoint[:, :, None])[:, :, 0]
-            states[:, i] = filtered.predicted[:, i] - moved  # (6)
-            if i:
-                g = runs.forces[:, i - 1]
-                pushed = (g.transpose(0, 2, 1) @ adjoint[:, :, None])[:, :, 0]
-                forces[:, i - 1] = -np.square(sizes) * pushed
-                measured += np.square(pushed).sum(axis=0)
-                expected += np.einsum("rze,rzy,rye->e", g, information, g)
+    measured, expected = np.zeros(count), np.zeros(count)
+    smoother_recursion(
+        *_contiguous(runs.states, runs.forces, runs.readings),
+        _completed(force, runs),
+        *(filtered.predicted, filtered.covariances, filtered.innovations),
+        *(filtered.gains, filtered.whiteners, states, forces, measured, expected),
+    )
     states, forces = np.nan_to_num(states), np.nan_to_num(forces)
-    score = np.nan_to_num(measured / np.maximum(expected, 1e-300), nan=1.0)
+    with np.errstate(all="ignore"):
+        score = np.nan_to_num(measured / np.maximum(expected, 1e-300), nan=1.0)
     return Smoothed(states, forces, score)
 
 
@@ -380,7 +332,16 @@ def fit_process_noise(
     return force, filtered, smoothed
 
 
+def _contiguous(*arrays: Array) -> tuple[Array, ...]:
+    """Return the arrays in the one layout for which the recursions are compiled."""
+    return tuple(np.ascontiguousarray(array) for array in arrays)
+
+
 def _completed(force: Array, runs: LinearRuns) -> Array:
-    """Return the deviations of all columns of G, those of coloured noise included."""
-    more = runs.forces.shape[3] - force.shape[-1]
-    return np.concatenate([force, np.ones((*force.shape[:-1], more))], axis=-1)
+    """Return the deviations of all columns of G for each run (B, E), those of coloured noise
+    included.
+    """
+    number, columns = len(runs.residuals), runs.forces.shape[3]
+    result = np.ones((number, columns))
+    result[:, : force.shape[-1]] = force
+    return result

@@ -301,3 +301,17 @@ def test_blank_lines_and_zeros_around_the_file_are_let_pass(write, tmp_path):
     path = tmp_path / "robot.urdf"
     path.write_bytes(b'\n\n<?xml version="1.0"?>' + one().encode() + b"\n\0")
     assert len(read(path).joints) == 1
+
+
+def test_a_joint_may_hang_on_a_world_that_is_no_link(mended):
+    robot_, notes = mended(
+        robot(
+            link("base"),
+            link("arm"),
+            joint("f", "world", "base", "fixed", ""),
+            joint("j", "base", "arm"),
+        )
+    )
+    assert "the link world, which the file does not state, is the fixed world" in notes
+    assert [body.name for body in robot_.bodies] == ["arm"]
+    assert robot_.aliases["base"] == "world"
