@@ -52,6 +52,7 @@ from bench.recordings.joined import load_all
 from bench.recordings.pieces import cut
 from bench.recordings.size import check_recording
 from bench.recordings.stamps import refuse_odd
+from bench.recordings.thinning import thin
 from bench.runs.threads import one_thread
 from sims import extended as extend
 from sims.base import Array, InputError
@@ -228,11 +229,12 @@ class _Explainer:
         # Before the worlds, which plan every step of every run.
         for odd in refuse_odd(self.recording, kind, force):
             say(f"{self.path}: {odd}")
+        self.recording, thinned = thin(self.recording, kind)
         self.recording, note = cut(self.recording, kind, subject.pieces, subject.whole)
         recorded = self.recording.runs[0].channels
         names = [channel.name for channel in kind.channels if channel.name in recorded]
         self.recording, quiet = add_least_noise(self.recording, names)
-        self.notes = tuple(text for text in (note, _added_noise(quiet)) if text)
+        self.notes = tuple(text for text in (thinned, note, _added_noise(quiet)) if text)
         for note in self.notes:
             say(note)
         check_recording(self.recording, kind(engine=self.engine), force)
@@ -250,7 +252,7 @@ class _Explainer:
         ]
         for line in left_out:
             say(line)
-        self.notes = (*((note,) if note else ()), *left_out)
+        self.notes = (*self.notes, *left_out)
         self.coarse: Coarse | None = None
         # Finer steps that differ from the file's, and the worlds of the file's where one is used.
         self.finer: Reusable[Finer] | None = None
@@ -518,7 +520,7 @@ class _Explainer:
     def _identified(self, followed: FollowedRuns) -> FollowedRuns:
         """The runs, filtered with base parameters that are identified by prediction errors."""
         # Loaded where there is a robot alone.
-        from bench.gap.prediction_error.base_parameters import identify_base
+        from bench.gap.prediction_error.likelihood_fit import identify_base
 
         world = self.fitting
         declared = {p.name: p.bounds for p in world.parameters}

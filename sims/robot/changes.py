@@ -123,7 +123,7 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
             said.append(f"{cause.told(recording)}: not in the file: {answer}")
             continue
         held.append(cause)
-        note = f"{cause.effect}: {answer[1:]}" if answer else _note(robot, cause.effect)
+        note = f"{cause.effect}: {answer[1:]}" if answer else _note(robot, cause)
         if note and note not in said:
             said.append(note)
         changed = [one.element for one in differing(robot.compiled, before, wanted, 0.0)]
@@ -148,11 +148,11 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
     return Applied(robot, text, model, wanted, comments, tuple(held), tuple(said))
 
 
-def _note(robot: Robot, effect: str) -> str | None:
+def _note(robot: Robot, cause: Cause) -> str | None:
     """What is to be known of an effect that the file holds; None where there is nothing."""
-    if effect == COULOMB and robot.friction_form == "soft":
+    if cause.effect == COULOMB and (robot.friction_form == "soft" or cause.coefficients[0] < 0):
         return _SOFT
-    return _NOTES.get(effect)
+    return _NOTES.get(cause.effect)
 
 
 def _is_in_series(cause: Cause) -> bool:

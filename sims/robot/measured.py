@@ -113,7 +113,7 @@ class MeasuredLinear(Linear):
         measured: Mapping[int, Array] | None = None,
         nearby: MeasuredLinear | None = None,
     ) -> None:
-        self._given, self._measured = trajectory, measured or {}
+        self._given, self._measured, self._nearby = trajectory, measured or {}, nearby
         if nearby is not None:
             self.quotients = nearby._tangent.quotients
         spacing = float(np.median(np.diff(scenario.times))) if scenario.times.size > 1 else 0.0
@@ -152,13 +152,34 @@ class MeasuredLinear(Linear):
         return Trajectory(self._motion.x, self._motion.v, self._motion.afloat)
 
     def _nominal(self) -> Motion:
-        motion = super()._nominal()
+        motion = self._near() or super()._nominal()
         given = self._given or self._from_samples(motion)
         # Joints in series are not measured: they keep the simulated motion.
         own = given.x.shape[1]
         x, v = motion.x.copy(), motion.v.copy()
         x[:, :own], v[:, :own] = given.x, given.v
         return self._with_loads(replace(motion, x=x, v=v, afloat=given.afloat))
+
+    def _near(self) -> Motion | None:
+        """Return the motion nearby with the commands of this model, which saves a simulation; None
+        where there is none, or where more moves than the joints that are given.
+        """
+        if self._nearby is None or self._given is None:
+            return None
+        motion, steps = self._nearby._motion, self._steps + 1
+        joints = len(self._simulator.addresses.positions)
+        alone = motion.x.shape[1] == joints and not motion.act.size and not motion.afloat.pose.size
+        if not alone or any(is_series(effect) for effect, _ in self._work.acting):
+            return None
+        self._readings = dict(self._nearby._readings)
+        given = self._simulator.controls(self._work, steps)
+        return replace(
+            motion,
+            controls=given.controls[0],
+            forces=self._simulator.wide(self._work.acting).spread(given.forces[0]),
+            instant=given.instant[0],
+            inputs={name: u[0] for name, u in given.felt.items()},
+        )
 
     def _from_samples(self, motion: Motion) -> Trajectory:
         """Interpolate the measured joints between samples by quintic Hermite polynomials."""
@@ -236,13 +257,16 @@ class MeasuredLinear(Linear):
             result.append((self.knots[:-1][active] + number, active))
         return result
 
-    def added(self, effects: Sequence[Added]) -> tuple[SingleArray, SingleArray]:
+    def added(self, effects: Sequence[Added], predicted: Array) -> tuple[SingleArray, SingleArray]:
         """Compute what candidate effects add to (3) and (4).
 
-        A force is taken for its mean over the interval between two samples.
+        A force is taken for its mean over the interval between two samples. Effects of sensors are
+        those on predicted readings: a gain of the reading itself would contain the noise that it
+        is to explain.
 
         Args:
             effects: K effects with their coefficients; those in series with a joint add nothing.
+            predicted: δ (T, Z) at the samples, predicted from the samples before each.
 
         Returns:
             Mean forces and controls (T - 1, E + nu, K), of which `IntervalMaps.inputs` make b; and
@@ -254,6 +278,7 @@ class MeasuredLinear(Linear):
         means = np.zeros((samples - 1, inputs, count), dtype=np.float32)
         readings = np.zeros((samples, self.observed.shape[1], count), dtype=np.float32)
         driven = self._driven([(e, c) for e, c in effects])
+        moved: Array | None = None
         for begin in range(0, count, BLOCK):
             part = range(begin, min(begin + BLOCK, count))
             changes: list[Change] = []
@@ -271,7 +296,11 @@ class MeasuredLinear(Linear):
             with np.errstate(all="ignore"):
                 pushed, read = self._tangent.pushed(changes, len(part))
                 means[:, :, own] = self._means(pushed)
-                readings[:, :, own] = self._read_directly(read, sensors)
+                if moved is None and any(sensors):
+                    moved = self.propagated(
+                        predicted, np.zeros((samples - 1, quotients.forces.shape[2]))
+                    )
+                readings[:, :, own] = self._read_directly(read, sensors, moved)
         return means, readings
 
     def _means(self, pushed: Array) -> Array:
@@ -295,15 +324,27 @@ class MeasuredLinear(Linear):
             result[active] = quotients.states[looked] @ result[active] + by[looked]
         return result
 
-    def _read_directly(self, read: Array, sensors: Sequence[Acting]) -> Array:
-        """Return ψ (T, C, K) from changes of readings (S, O, K) and from sensors' effects."""
+    def _read_directly(
+        self, read: Array, sensors: Sequence[Acting], predicted: Array | None
+    ) -> Array:
+        """Return ψ (T, C, K) from changes of readings (S, O, K) and from sensors' effects on
+        predicted deviations of the state (S + 1, Z).
+        """
         result = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
-        some = [k for k, acting in enumerate(sensors) if acting or read[:, :, k].any()]
-        if some:
-            nothing = np.zeros((len(some), self._motion.x.shape[0], self._tangent.size))
-            own = [sensors[k] for k in some]
-            seen = self._seen(nothing, np.moveaxis(read[:, :, some], 2, 0), own)
-            result[:, :, some] = np.moveaxis(seen - self.observed, 0, 2)
+        shape = self._motion.x.shape[0], self._tangent.size
+        changed = [k for k, acting in enumerate(sensors) if not acting and read[:, :, k].any()]
+        if changed:
+            nothing = np.zeros((len(changed), *shape))
+            unsensed: list[Acting] = [()] * len(changed)
+            seen = self._seen(nothing, np.moveaxis(read[:, :, changed], 2, 0), unsensed)
+            result[:, :, changed] = np.moveaxis(seen - self.observed, 0, 2)
+        sensed = [k for k, acting in enumerate(sensors) if acting]
+        if sensed and predicted is not None:
+            states = np.broadcast_to(predicted, (len(sensed) + 1, *shape))
+            changes = np.zeros((len(sensed) + 1, *read.shape[:2]))
+            changes[:-1] = np.moveaxis(read[:, :, sensed], 2, 0)
+            seen = self._seen(states, changes, [*(sensors[k] for k in sensed), ()])
+            result[:, :, sensed] = np.moveaxis(seen[:-1] - seen[-1], 0, 2)
         return result
 
     def propagated(self, begun: Array, forces: Array) -> Array:

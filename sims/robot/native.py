@@ -138,8 +138,8 @@ def _add_quadratic(fields: Fields, robot: Robot, place: str, c: Array) -> None:
 def _add_friction(fields: Fields, robot: Robot, place: str, c: Array) -> None:
     column = robot.joint(place).velocity
     loss = fields["dof_frictionloss"]
-    # In the lanes where it acts alone: what is zero leaves the file as it is.
-    rubs = c[0] != 0
+    # Less friction than the file states has the file's form.
+    rubs = c[0] > 0
     loss[:, column] = added(loss[:, column], c[0])
     write_friction_form(fields, robot, rubs, column)
 

@@ -284,7 +284,8 @@ class FollowedRuns:
         pushed = np.zeros((number, samples - 1, inputs, len(effects)), dtype=np.float32)
         readings = np.zeros((number, samples, channels, len(effects)), dtype=np.float32)
         for run, linear in enumerate(self.linear):
-            own, read = linear.added(effects)
+            predicted = self.filtered.predicted[run, : linear.knots.size, : self.runs.prior.size]
+            own, read = linear.added(effects, np.nan_to_num(predicted))
             pushed[run, : own.shape[0]] = own
             readings[run, : read.shape[0]] = read
         readings[~self.runs.recorded] = 0.0

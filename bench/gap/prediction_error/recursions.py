@@ -17,7 +17,7 @@ _compiled: Any = numba.njit(cache=True, error_model="numpy", nogil=True)
 
 
 def _product(a: Array, b: Array, out: Array) -> None:
-    """out = a b; zeros of a are skipped, since most entries of a state transition are zero."""
+    """Write a b to `out`; zeros of a are skipped, since most entries of a state transition are."""
     for i in range(a.shape[0]):
         for j in range(b.shape[1]):
             out[i, j] = 0.0
@@ -29,7 +29,7 @@ def _product(a: Array, b: Array, out: Array) -> None:
 
 
 def _sandwich(a: Array, p: Array, half: Array, out: Array) -> None:
-    """out = a p aᵀ for symmetric p."""
+    """Write a p aᵀ for symmetric p to `out`."""
     product(a, p, half)
     size = a.shape[0]
     for i in range(size):
@@ -206,9 +206,16 @@ def _smooth(
 ) -> None:
     """Smooth B runs by (5) and (6); results are written to the last four arguments.
 
-    Arguments are those of `_filter` and what it has written.
-
     Args:
+        states: A (B, T - 1, Z, Z).
+        forces: G (B, T - 1, Z, E).
+        readings: H (B, T, C, Z).
+        deviations: (B, E) standard deviations of the missing forces.
+        predicted: δ- (B, T, Z), and what follows as the filter has written it.
+        covariances: (B, T, Z, Z).
+        innovations: (B, T, C).
+        gains: (B, T, Z, C).
+        whiteners: (B, T, C, C).
         smoothed: δ (B, T, Z).
         missing: f (B, T - 1, E).
         measured: (E,) the numerator of (7), to which is added.

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,12 +43,12 @@ from bench.gap.model.problem import Fit, Known, Start
 from bench.gap.model.tangents import begun
 from bench.gap.prediction_error.candidate_responses import Columns, FollowedRuns
 from bench.gap.prediction_error.identification import Selected, identify, regress
+from bench.gap.prediction_error.likelihood_fit import maximise_likelihood, single_step
 from bench.gap.prediction_error.null_distribution import null_scores, p_value_of_gain
 from bench.gap.prediction_error.selection import Regression
 from sims.base import Array
 from sims.robot.forces import OVER_TIME
 from sims.robot.native import FIELDS
-from sims.robot.scales import scales
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
 from sims.simulated import Simulated
@@ -76,8 +76,12 @@ MAX_RIVALS = 3
 """Maximum number of rivals of each effect that are fitted by simulation."""
 MAX_STEPS = 4
 """Maximum number of effects that are added one after another."""
-FIRST_SHARE = 0.1
-"""Share of a typical size, or of the stated friction, with which an effect is first tried."""
+JOINT_MODEL = ("friction.coulomb", "drag.linear", "inertia.armature")
+"""Effects at a joint that are always tried there."""
+SERVO_MODEL = ("actuator.stiffness", "actuator.damping")
+"""Effects at the servo of a joint that are always tried there."""
+MAX_JOINT_TRIALS = 3
+"""Maximum number of them that are tried in the model at each step."""
 OFFSET_THRESHOLD = 10.0
 """A smoothed first position takes the place of the recorded one from so many times the noise."""
 RELINEARISATION_THRESHOLD = 100.0
@@ -88,14 +92,31 @@ MAX_CACHED_FILTERS = 6
 """Number of filters that are kept for effects that were tried."""
 MAX_TRIALS = 4
 """Maximum number of effects that are tried in the model at each step."""
+BEST_TRIALS = 2
+"""Number of these whose coefficients are improved."""
+NEARBY = (0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1)
+"""Factors of a coefficient of dry friction at which a fit looks for a lower cost nearby: where
+joints stick, the cost is not smooth.
+"""
 MIN_GAIN_SHARE = 0.3
 """Share of the largest gain by regression that an effect must have to be tried in the model."""
-GAUSS_NEWTON_STEPS = 1
-"""Number of Gauss-Newton steps for an effect that is tried in the model."""
+GAUSS_NEWTON_STEPS = 2
+"""Maximum number of Gauss-Newton steps for an effect that is tried in the model."""
 RELATIVE_DIFFERENCE = 0.02
 """Share of a coefficient by which it is moved for its derivative."""
 EXPLAINED_EXCESS = 0.03
 """Excess over the noise below which a fitted set explains the data."""
+
+
+class _Tried(NamedTuple):
+    """An effect that was tried in the model: parameters (P,), the runs as a filter follows them,
+    its log likelihood, and the name of the effect.
+    """
+
+    theta: Array
+    followed: FollowedRuns
+    likelihood: float
+    name: str
 
 
 class SoftFrictionError(Exception):
@@ -180,9 +201,9 @@ class PredictionErrorSearch(Search):
         ):
             return best
         tried = self._try_one_more(self.follow(), self.base.fit.theta, [])
-        if tried is None:
+        if not tried:
             return best
-        theta, followed, likelihood, name = tried
+        theta, followed, likelihood, name = tried[0]
         own = self._followed_by(best).log_likelihood
         price = sum(self._penalty(one) for one in best.names) - self._penalty(name)
         if 2.0 * (own - likelihood) > price + RIVAL_MARGIN:
@@ -300,14 +321,14 @@ class PredictionErrorSearch(Search):
             for name in names:
                 theta[self.world.slots[name]] = own[self.world.slots[name]]
             theta, followed, likelihood = self._follow_with(theta, names)
-        for _ in range(MAX_STEPS):
+        alone: list[_Tried] = []
+        for step in range(MAX_STEPS):
             tried = self._try_one_more(followed, theta, names)
-            if tried is None:
+            if not step and not names:
+                alone = tried
+            if not tried or 2.0 * (tried[0].likelihood - likelihood) < self._penalty(tried[0].name):
                 break
-            name = tried[3]
-            if 2.0 * (tried[2] - likelihood) < self._penalty(name):
-                break
-            theta, followed, likelihood, _ = tried
+            theta, followed, likelihood, name = tried[0]
             contained = self.world.effects[name].contains
             names = [n for n in names if n not in contained] + [name]
             if not (followed.losses_without_force > MIN_LOSS_WITHOUT_FORCE).any():
@@ -315,24 +336,42 @@ class PredictionErrorSearch(Search):
         if not names:
             return self.base
         fitted = self._fit(Start(tuple(names), theta, self._first_states(followed)))
-        return self._without_idle_effects(fitted) if np.isfinite(fitted.fit.cost) else self.base
+        if not self._is_explained(fitted):
+            # Filters of two effects at one joint may be as likely where their simulations are not.
+            starts = [
+                Start((one.name,), one.theta, self._first_states(one.followed)) for one in alone
+            ]
+            fits = [self._fit(start) for start in starts if start.effects != fitted.names]
+            fitted = max([fitted, *fits], key=lambda model: model.merit)
+        if not np.isfinite(fitted.fit.cost):
+            return self.base
+        if not self._is_explained(fitted) and is_likelier_soft(self, fitted, SWITCH):
+            raise SoftFrictionError
+        return self._without_idle_effects(fitted)
 
     def _try_one_more(
         self, followed: FollowedRuns, theta: Array, names: Sequence[str]
-    ) -> tuple[Array, FollowedRuns, float, str] | None:
-        """Follow the runs with each effect that gains most in addition to the model, and return the
-        likeliest: its parameters, filter, log likelihood and name. None where no effect gains.
+    ) -> list[_Tried]:
+        """Follow the runs with each effect that gains most in addition to the model.
+
+        Return the likeliest two, the likelier first; none where no effect gains.
         """
-        watch, tried = self.world.watch, []
+        watch, tried = self.world.watch, list[_Tried]()
         watch.stage("testing effects in the model one by one", MAX_TRIALS)
         for name, start in self._propose_effects(followed, theta, names):
-            tried.append((*self._follow_with(start, [*names, name], turns=0), name))
+            tried.append(_Tried(*self._follow_with(start, [*names, name], turns=0), name))
             watch.advance()
             watch.check()
         # The coefficients of the best two are improved before they are compared.
-        tried.sort(key=lambda one: self._penalty(one[3]) - 2.0 * one[2])
-        tried = [(*self._follow_with(one[0], [*names, one[3]]), one[3]) for one in tried[:2]]
-        return max(tried, key=lambda one: 2.0 * one[2] - self._penalty(one[3]), default=None)
+        tried.sort(key=self._unlikeliness)
+        tried = [
+            _Tried(*self._follow_with(one.theta, [*names, one.name]), one.name)
+            for one in tried[:BEST_TRIALS]
+        ]
+        return sorted(tried, key=self._unlikeliness)
+
+    def _unlikeliness(self, tried: _Tried) -> float:
+        return self._penalty(tried.name) - 2.0 * tried.likelihood
 
     def _without_idle_effects(self, model: Model) -> Model:
         """Remove effects that do not pay, and replace a family by a member that does as well."""
@@ -425,38 +464,38 @@ class PredictionErrorSearch(Search):
         theta: Array,
         names: Sequence[str],
     ) -> list[tuple[str, Array]]:
-        """Return the standard joint model at the joint where most is missing: less dry friction
-        than the model file states, armature, viscous damping and an encoder offset, each with
-        first parameters.
+        """Return effects of the standard joint model at the joint where most is missing, each with
+        a first coefficient: dry and viscous friction, armature, stiffness and damping of the servo,
+        and an offset of the encoder.
 
         A regression may miss them: they are not linear where a joint sticks, where a servo is stiff
         for a light joint, and where an offset changes the pose.
         """
         world = self.world
-        assert isinstance(world.simulator, RobotSimulator)
         coordinates = world.simulator.system.coordinates
         joint = int(np.argmax(followed.losses_without_force[: len(coordinates)]))
         place = coordinates[joint].removeprefix("q.")
-        inertia = float(scales(world.simulator.robot).inertia[joint])
         found = []
         offset, apart = f"sensor.bias@q.{place}", self._offset_from_command(joint)
         if offset in world.library and offset not in names and apart:
             start = theta.copy()
             start[world.slots[offset]] = apart
             found.append((offset, start))
-        speed = max(float(np.abs(one.trajectory.v[:, joint]).max()) for one in followed.linear)
-        damping = FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9)
-        for effect in ("friction.coulomb", "inertia.armature", "drag.linear"):
-            name = f"{effect}@{place}"
-            if name not in world.library or name in names:
-                continue
-            low, high = coefficient_bounds(world, name)[0]
-            value = {"inertia.armature": inertia, "drag.linear": damping}.get(
-                effect, FIRST_SHARE * low
-            )
-            if value:
+        servo = str(getattr(world.simulator.system, "servos", {}).get(joint, "")).removeprefix("u.")
+        model = [f"{effect}@{place}" for effect in JOINT_MODEL]
+        model += [f"{effect}@{servo}" for effect in SERVO_MODEL]
+        steps = []
+        for name in model:
+            if name in world.library and name not in names:
+                number = world.places(name)[0]
+                (bounds,) = coefficient_bounds(world, name)
+                step, gain = single_step(followed, number, bounds)
+                steps.append((gain, name, number, step))
+        steps.sort(key=lambda one: -one[0])
+        for gain, name, number, step in steps[:MAX_JOINT_TRIALS]:
+            if gain > 0.5 * self._penalty(name):
                 start = theta.copy()
-                start[world.slots[name]] = np.clip(value, low, high)
+                start[number] += step
                 found.append((name, start))
         return found
 
@@ -468,29 +507,25 @@ class PredictionErrorSearch(Search):
         """
         key = theta.tobytes()
         known = self._trial_filters.get(key)
-        world, noise = self.world, self.follow().noise
-        best: tuple[Array, FollowedRuns, float] | None = None
-        for turn in range(turns + 1):
-            force = self.follow().force if best is None else best[1].force
-            followed = known if turn == 0 and known is not None else None
-            if followed is None:
-                followed = FollowedRuns.follow(world, theta, noise, None, force=force)
-                if self._has_moved_far(followed):
-                    # With an encoder offset the true motion differs from the readings.
-                    own = followed.trajectories
-                    followed = FollowedRuns.follow(world, theta, noise, own, force=force)
-            likelihood = followed.log_likelihood
-            if best is not None and likelihood < best[2]:
-                break
-            best = theta, followed, likelihood
-            if turn < turns:
-                theta = self._gauss_newton_step(followed, theta, names)
-        assert best is not None
+        begin = self._follow_near(theta, self.follow()) if known is None else known
+        bounds = [b for name in names for b in coefficient_bounds(self.world, name)]
+        places = [place for name in names for place in self.world.places(name)]
+        best = maximise_likelihood(begin, places, bounds, turns, self._follow_near)
         self._trial_filters = {
-            best[0].tobytes(): best[1],
+            best.theta.tobytes(): best,
             **dict(list(self._trial_filters.items())[:MAX_CACHED_FILTERS]),
         }
-        return best
+        return best.theta, best, best.log_likelihood
+
+    def _follow_near(self, theta: Array, known: FollowedRuns) -> FollowedRuns:
+        """Follow the runs with other parameters, the process noise being near one that is known."""
+        world, noise = self.world, self.follow().noise
+        followed = FollowedRuns.follow(world, theta, noise, None, force=known.force)
+        if not self._has_moved_far(followed):
+            return followed
+        # With an encoder offset the true motion differs from the readings.
+        motion = followed.trajectories
+        return FollowedRuns.follow(world, theta, noise, motion, force=known.force)
 
     def _offset_from_command(self, joint: int) -> float:
         """Return the mean difference of a joint's readings from the command of its position servo;
@@ -515,25 +550,6 @@ class PredictionErrorSearch(Search):
         size = followed.linear[0].positions
         moved = np.abs(followed.smoothed.states[:, :, :size])
         return bool(moved.max() > RELINEARISATION_THRESHOLD * float(np.nanmax(self.noise.sigma)))
-
-    def _gauss_newton_step(
-        self, followed: FollowedRuns, theta: Array, names: Sequence[str]
-    ) -> Array:
-        """The coefficients of effects after a Gauss-Newton step on the innovations."""
-        places, derivatives = self._derivatives(
-            theta,
-            names,
-            lambda probes: followed.responses(followed.columns(probes)).astype(np.float64),
-        )
-        rows = derivatives.reshape(-1, len(places))
-        target = followed.filtered.whitened.reshape(-1)
-        result = theta.copy()
-        result[places] += np.linalg.lstsq(rows, target, rcond=1e-8)[0]
-        for name in names:
-            slot = self.world.slots[name]
-            low, high = np.array(coefficient_bounds(self.world, name)).T
-            result[slot] = np.clip(result[slot], low, high)
-        return result
 
     def _derivatives(
         self, theta: Array, names: Sequence[str], respond: Callable[[Sequence[Probe]], Array]
@@ -667,7 +683,26 @@ class PredictionErrorSearch(Search):
             return found
         begun(self.world, found.fit.theta, found.fit.states, anew=True)
         self.refit([found.fit.start()], race=False)
-        return self.models[frozenset(start.effects)]
+        found = self.models[frozenset(start.effects)]
+        for name in found.names:
+            if has_dry_friction(self.world, [name]) and not self._is_explained(found):
+                found = self._fit_nearby(found, name)
+        return found
+
+    def _fit_nearby(self, model: Model, name: str) -> Model:
+        """Fit a model again from the best of some coefficients of dry friction nearby."""
+        starts = []
+        for place in self.world.places(name):
+            for factor in NEARBY:
+                theta = model.fit.theta.copy()
+                theta[place] *= factor
+                starts.append(Start(model.names, theta, model.fit.states))
+        costs = costs_of_starts(self.world, self.noise, starts, share=1.0, lost=np.inf)
+        best = int(np.argmin(costs))
+        if not costs[best] < model.fit.cost:
+            return model
+        self.refit([starts[best]], race=False)
+        return self.models[frozenset(model.names)]
 
     def _is_explained(self, model: Model) -> bool:
         """Whether a fitted model leaves no more than noise."""

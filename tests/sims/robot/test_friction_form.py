@@ -186,3 +186,11 @@ def test_the_model_file_states_solver_parameters_of_stiff_friction_alone(extende
     kind = extended.kind.with_friction_form(form)
     arm = kind(observe=["q.shoulder", "q.elbow"], effects=["friction.coulomb@elbow"])
     np.testing.assert_allclose(arm.simulate(np.array([[0.06]]), scenario())[0], moved, atol=1e-9)
+
+
+@pytest.mark.parametrize("form", ["soft", "stiff"])
+def test_less_friction_than_the_file_states_keeps_the_form_of_the_file(tmp_path, form):
+    stated = 'frictionloss="0.1" solreffriction="0.03 1"'
+    arm = simulator(tmp_path, "implicitfast", stated, form, ["friction.coulomb@elbow"])
+    wanted = plain(ARM.format(integrator="implicitfast", elbow=stated.replace("0.1", "0.06")))
+    np.testing.assert_allclose(arm.simulate(np.array([[-0.04]]), scenario())[0], wanted, atol=1e-10)

@@ -8,11 +8,11 @@ import pytest
 from bench.gap.explain import explain
 
 
-def answer(name):
+def answer(name, **options):
     folder = Path(os.environ.get("SIMGAP_DATA", "")).parent / "cases"
     if not folder.is_dir():
         pytest.skip(f"no cases: {folder} is missing (set SIMGAP_DATA)")
-    return explain(folder / name / "log.csv").answer
+    return explain(folder / name / "log.csv", **options).answer
 
 
 @pytest.mark.slow
@@ -38,3 +38,21 @@ def test_damping_beside_a_stiff_servo_that_saturates():
 @pytest.mark.slow
 def test_a_four_bar_without_a_cause_is_adequate():
     assert answer("fourbar_clean").verdict == "adequate"
+
+
+@pytest.mark.slow
+def test_what_acts_alike_is_told_after_a_cause_that_does_not_hold_is_removed():
+    """The servo's damping acts as the joint's does, since its force limit is not reached."""
+    verdict = answer("friction_and_drag_one_joint")
+    assert verdict.verdict == "ambiguous"
+    sets = [{cause.effect, *cause.alternatives} for cause in verdict.causes]
+    assert {"actuator.damping@m_shoulder", "drag.linear@shoulder"} in sets
+    assert {"friction.coulomb@shoulder"} in sets
+    assert len(sets) == 2
+
+
+@pytest.mark.slow
+def test_a_free_number_far_from_the_file_is_identified_by_prediction_errors():
+    verdict = answer("drag_stiff_servo_saturates", free=["damping@elbow"])
+    assert verdict.verdict == "adequate"
+    assert verdict.parameters["drag.linear@elbow"].value == pytest.approx(60.0, rel=0.01)

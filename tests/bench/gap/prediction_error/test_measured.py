@@ -45,13 +45,19 @@ def motion_with(world, theta):
     return MeasuredLinear(world.simulator, world.nominal(), world.tracks[0].scenario, start, motion)
 
 
+def added(linear, world, name, c):
+    """What an effect adds about the motion, with no deviation from it."""
+    size = 2 * (len(world.states) // 2)
+    return linear.added([(world.effects[name], c)], np.zeros((linear.knots.size, size)))
+
+
 @pytest.mark.parametrize("name", EFFECTS)
 def test_the_model_misses_a_motion_by_what_the_missing_effect_adds(world, name):
     """Eq. (3) of `sims.robot.measured` with δ = 0: the defects are Σ c b."""
     c = np.array(EFFECTS[name])
     linear = motion_with(world, theta_of(world, name, c))
     maps = linear.interval_maps()
-    pushed, _ = linear.added([(world.effects[name], c)])
+    pushed, _ = added(linear, world, name, c)
     expected = (maps.inputs @ pushed)[:, :, 0]
     joints = len(world.states) // 2
     # Velocities alone: a force is taken for its mean, which moves positions a little otherwise.
@@ -67,7 +73,7 @@ def test_without_an_effect_nothing_is_missed(world):
 
 def test_a_sensor_effect_changes_readings_alone(world):
     linear = motion_with(world, world.nominal())
-    pushed, readings = linear.added([(world.effects["sensor.bias@q.elbow"], np.array([0.01]))])
+    pushed, readings = added(linear, world, "sensor.bias@q.elbow", np.array([0.01]))
     column = world.channels.index("q.elbow")
     np.testing.assert_allclose(readings[:, column, 0], 0.01, atol=1e-7)
     assert not pushed.any()
