@@ -89,6 +89,8 @@ class World:
         simulated: what effects without a tangent change about them, by name and coefficients.
         followed: the runs of a robot as a filter follows them, if it does
             (`bench.gap.prediction_error.candidate_responses`).
+        identified: (b,) base parameters with which the filter follows a robot's runs; None where
+            these are the nominal ones.
         measured: of runs of a robot, states from readings alone
             (`bench.gap.prediction_error.measured_states`).
         crew: who simulates and fits; this process alone, unless another is put here.
@@ -162,6 +164,7 @@ class World:
         self.neighbourhoods: dict[tuple[int, bytes, bytes], Any] = {}
         self.simulated: dict[tuple[str, bytes], Array] = {}
         self.followed: Any = None
+        self.identified: Array | None = None
         self.measured: dict[int, Mapping[int, Array]] = {}
         self.simulations = 0
         self._cache = LaneCache()
@@ -417,7 +420,7 @@ class World:
         other.parameters = self.parameters
         other.watch, other.crew = self.watch, self.crew
         other.followed, other.guess = self.followed, self.guess
-        other.derivatives = self.derivatives
+        other.derivatives, other.identified = self.derivatives, self.identified
         self.crew.join(other)
         return other
 
@@ -527,6 +530,8 @@ class World:
             followed: `bench.gap.prediction_error.candidate_responses.FollowedRuns`.
         """
         self.followed = followed
+        base, nominal = followed.theta[self.base], self.nominal()[self.base]
+        self.identified = None if np.array_equal(base, nominal) else base
         begun = followed.first_states()
         fine = np.isfinite(begun).all()
         self.guess = np.where(self.known | ~fine, self.guess, begun)

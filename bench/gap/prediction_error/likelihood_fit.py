@@ -16,6 +16,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from bench.gap.model.bounds import bound_of, coefficient_bounds
 from bench.gap.model.noise import Noise
 from bench.gap.model.widen import range_around, use_bounds
 from bench.gap.model.world import World
@@ -33,8 +34,14 @@ LEAST_GAIN = 1.0
 """Log likelihood that a step must gain for another one to follow."""
 HALVINGS = 3
 """Number of times a step that gains nothing is halved."""
+RESISTANCE = ("friction.coulomb", "drag.linear", "force.bias")
+"""Effects at a joint that are fitted beside base parameters."""
+MAX_JOINTS = 3
+"""Maximum number of joints at which they are."""
 RIDGE = 1e-9
 """Ridge of the normal equations, as a share of each parameter's sum of squares."""
+MISSING = 20.0
+"""Twice the log likelihood that must be lost without process noise for a force to be missing."""
 CLEAR = 2.0
 """Log likelihood that base parameters must gain over the nominal ones."""
 
@@ -42,7 +49,9 @@ CLEAR = 2.0
 def identify_base(world: World, noise: Noise, followed: FollowedRuns) -> FollowedRuns:
     """Identify the base parameters of a robot from the innovations of a filter.
 
-    The range of a parameter whose estimate lies outside is widened to contain it.
+    Friction and constant forces of the joints where a force is missing are fitted beside them, and
+    left out again: a mass without them would stand for them. The range of a parameter whose
+    estimate lies outside is widened to contain it.
 
     Args:
         world: the runs for fitting.
@@ -50,7 +59,8 @@ def identify_base(world: World, noise: Noise, followed: FollowedRuns) -> Followe
         followed: the runs, filtered with the nominal parameters.
 
     Returns:
-        The runs, filtered with the parameters that were found; those of before where nothing gains.
+        The runs, filtered with the parameters that were found; those of before where nothing gains
+        or a parameter ends at the widest bound.
     """
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
@@ -59,14 +69,43 @@ def identify_base(world: World, noise: Noise, followed: FollowedRuns) -> Followe
 
     places = world.base.tolist()
     limits = [range_around(world, i) for i in places]
-    best = maximise_likelihood(followed, places, limits, ITERATIONS, follow)
-    if best.log_likelihood - followed.log_likelihood < CLEAR or not best.is_sound:
+    resisting = [(i, b) for name in _resistance(followed) for i, b in _coefficients(world, name)]
+    found = []
+    for beside in ([], resisting):
+        own = [*places, *(i for i, _ in beside)]
+        bounds = [*limits, *(one for _, one in beside)]
+        tried = maximise_likelihood(followed, own, bounds, ITERATIONS, follow)
+        ends = [bound_of(float(tried.theta[i]), *b) for i, b in zip(places, limits, strict=True)]
+        if tried.is_sound and not any(ends):
+            found.append(tried)
+        # What friction could stand for is explained by the base parameters alone.
+        if found and (tried.losses_without_force < MISSING).all():
+            break
+    best = max(found, key=lambda one: one.log_likelihood, default=followed)
+    if best.log_likelihood - followed.log_likelihood < CLEAR:
         return followed
     values = {i: float(best.theta[i]) for i in places}
     outside = {i: v for i, v in values.items() if not _is_within(world.parameters[i].bounds, v)}
     wider = {world.parameters[i].name: range_around(world, i, v) for i, v in outside.items()}
     use_bounds(world, wider)
-    return best
+    theta = followed.theta.copy()
+    theta[places] = best.theta[places]
+    return follow(theta, best)
+
+
+def _resistance(followed: FollowedRuns) -> list[str]:
+    """Effects that resist the motion of the joints where most is missing."""
+    world = followed.world
+    coordinates = world.simulator.system.coordinates
+    losses = followed.losses_without_force[: len(coordinates)]
+    joints = [coordinates[j].removeprefix("q.") for j in np.argsort(-losses)[:MAX_JOINTS].tolist()]
+    names = [f"{effect}@{joint}" for joint in joints for effect in RESISTANCE]
+    return [name for name in names if name in world.slots]
+
+
+def _coefficients(world: World, name: str) -> list[tuple[int, Bounds]]:
+    """Places and bounds of an effect's coefficients."""
+    return list(zip(world.places(name), coefficient_bounds(world, name), strict=True))
 
 
 def maximise_likelihood(

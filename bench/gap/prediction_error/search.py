@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -174,7 +175,7 @@ class PredictionErrorSearch(Search):
         self.world.watch.stage("testing what gives between drive and links", len(probes))
         starts = []
         for probe in probes:
-            theta = self.base.fit.theta.copy()
+            theta = self._reference.copy()
             theta[self.world.slots[probe.effect]] = probe.c
             starts.append(Start((probe.effect,), theta, self.world.guess))
         costs = costs_of_starts(self.world, self.noise, starts, share=1.0, lost=np.inf)
@@ -200,7 +201,7 @@ class PredictionErrorSearch(Search):
             or self._must_end
         ):
             return best
-        tried = self._try_one_more(self.follow(), self.base.fit.theta, [])
+        tried = self._try_one_more(self.follow(), self._reference, [])
         if not tried:
             return best
         theta, followed, likelihood, name = tried[0]
@@ -230,7 +231,7 @@ class PredictionErrorSearch(Search):
         if not plain:
             return self.base
         start = self._start(selected.groups, selected.coefficients)
-        only, own = self.base.fit.theta.copy(), self._plain_theta(start)
+        only, own = self._reference.copy(), self._plain_theta(start)
         for name in plain:
             only[self.world.slots[name]] = own[self.world.slots[name]]
         best = self._fit(Start(plain, only, self._first_states(self.follow())))
@@ -313,7 +314,7 @@ class PredictionErrorSearch(Search):
             selected: what regression has selected.
             begin: dry friction that is in the model from the beginning.
         """
-        theta, names = self.base.fit.theta.copy(), list(begin)
+        theta, names = self._reference.copy(), list(begin)
         followed = self.follow()
         likelihood = followed.log_likelihood
         if names:
@@ -622,9 +623,21 @@ class PredictionErrorSearch(Search):
 
     # -- the linear models
 
+    @cached_property
+    def _reference(self) -> Array:
+        """(P,) parameters without any effect: those of the base model, with free numbers as they
+        are identified beside effects. A base model without these may need absurd numbers.
+        """
+        theta: Array = self.base.fit.theta.copy()
+        identified = self.world.identified
+        if identified is not None:
+            kept = [i not in self.frozen for i in self.world.base.tolist()]
+            theta[self.world.base[kept]] = identified[kept]
+        return theta
+
     def follow(self) -> FollowedRuns:
         """Return the runs as the filter follows them with the base model."""
-        return FollowedRuns.of_model(self.world, self.base.fit.theta, self.noise)
+        return FollowedRuns.of_model(self.world, self._reference, self.noise)
 
     def _library_columns(self) -> Columns:
         if self._columns is None:
@@ -759,7 +772,7 @@ class PredictionErrorSearch(Search):
 
     def _start(self, groups: Sequence[Group], coefficients: Sequence[Array]) -> Start:
         """Where the fit of a set by simulation begins."""
-        theta = self.base.fit.theta.copy()
+        theta = self._reference.copy()
         for group, own in zip(groups, coefficients, strict=True):
             theta[self.world.slots[group.effect]] = self._numbers(group, own)
         return Start(tuple(group.effect for group in groups), theta, self.base.fit.states)
