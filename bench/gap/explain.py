@@ -491,9 +491,10 @@ class _Explainer:
     @property
     def _asks_units_late(self) -> bool:
         """Whether units are questioned where no effect explains the gap, as those of a robot's
-        recording whose free numbers could be identified.
+        recording are unless its free numbers could not be identified.
         """
-        return self.kind.has_model and not (self.free_numbers and self.identified is None)
+        lost = self.free_numbers and self.identified is None and self.fitting.followed is not None
+        return self.kind.has_model and not lost
 
     @property
     def free_numbers(self) -> bool:
@@ -613,6 +614,9 @@ class _Explainer:
             if not fine.suits(left):
                 continue
             self._enter(fine.kind)
+            if self.fitting.followed is None:
+                # A model that explodes with the file's step may be followed with a finer one.
+                self._follow()
             other = fit_base(self.fitting, self.noise, self._nearby(base))
             reached, left = self._judged(other)
             if not is_finer_step_better(reached - value, gap, left - 1.0):
@@ -693,7 +697,7 @@ class _Explainer:
         """Where a fit of finer steps begins: a step moves the best parameters a little, and its
         fit needs no other starts; None where the coarse one has come to nothing.
         """
-        if not np.isfinite(base.fit.cost):
+        if not np.isfinite(base.fit.cost) or self.identified is not None:
             return self._given()
         nearby: Array = base.fit.theta[self.fitting.base]
         return nearby

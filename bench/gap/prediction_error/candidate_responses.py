@@ -443,8 +443,9 @@ def _fit_noise(runs: LinearRuns, noise: Noise, force: Array, typical: Array) -> 
         coloured, white = with_coloured_noise(runs, tried)
         if best is not None:
             found = filter_runs(coloured, best.force, white)
-            gained = float(found.log_likelihood.sum() - best.filtered.log_likelihood.sum())
-            if gained < COLOURED:
+            before, after = best.filtered.log_likelihood.sum(), found.log_likelihood.sum()
+            # Both are minus infinity where the model explodes.
+            if not after > before + COLOURED:
                 break
             force = best.force
         best = _NoiseFit(tried, *fit_process_noise(coloured, force, white, typical))

@@ -95,6 +95,8 @@ MAX_TRIALS = 4
 """Maximum number of effects that are tried in the model at each step."""
 BEST_TRIALS = 2
 """Number of these whose coefficients are improved."""
+SOFT_FACTORS = (1.0, 2.0, 4.0)
+"""Multiples of the stiff friction that are tried in the soft form, which is weaker at low speed."""
 NEARBY = (0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1)
 """Factors of a coefficient of dry friction at which a fit looks for a lower cost nearby: where
 joints stick, the cost is not smooth.
@@ -148,8 +150,10 @@ class PredictionErrorSearch(Search):
         best = self._fit_dry_friction(selected)
         if not self._is_explained(best):
             best = self._of_higher_merit(best, self._fit_quick_selection(selected))
-        if not self._is_explained(best) and not self._must_end and self._lacks_force(selected):
+        if not self._is_explained(best) and not self._must_end and self._base_lacks_force:
             best = self._of_higher_merit(best, self._select_in_model(selected, ()))
+        if not self._is_explained(best) and not self._must_end and self._base_lacks_force:
+            self._refuse_softer_friction(best)
         if not self._is_explained(best):
             selected = self._select_with_shapes(selected)
             best = self._of_higher_merit(best, self._fit_quick_selection(selected))
@@ -243,6 +247,34 @@ class PredictionErrorSearch(Search):
         if softer and is_likelier_soft(self, best, SWITCH):
             raise SoftFrictionError
         return self._of_higher_merit(best, self._select_in_model(selected, plain))
+
+    @property
+    def _base_lacks_force(self) -> bool:
+        """Whether a force is missing in the base model."""
+        return bool((self.follow().losses_without_force > MIN_LOSS_WITHOUT_FORCE).any())
+
+    def _refuse_softer_friction(self, best: Model) -> None:
+        """Follow the runs with dry friction in MuJoCo's soft form at the joint where most is
+        missing.
+
+        Raises:
+            SoftFrictionError: that is likelier than the best model of stiff friction.
+        """
+        world: Any = self.world
+        followed = self.follow()
+        coordinates = world.simulator.system.coordinates
+        joint = int(np.argmax(followed.losses_without_force[: len(coordinates)]))
+        name = f"friction.coulomb@{coordinates[joint].removeprefix('q.')}"
+        if world.kind.robot.friction_form == "soft" or name not in world.library:
+            return
+        (place,), (bounds,) = world.places(name), coefficient_bounds(world, name)
+        step, _ = single_step(followed, place, bounds)
+        own = self._followed_by(best).log_likelihood
+        for factor in SOFT_FACTORS if step > 0 else ():
+            theta = self._reference.copy()
+            theta[place] = np.clip(factor * step, *bounds)
+            if self._likelihood(theta, soft_kind(world.kind)) > own + 0.5 * SWITCH:
+                raise SoftFrictionError
 
     def _plain_friction(self, selected: Selected) -> tuple[str, ...]:
         """The dry friction of a selection, without a state; a family in place of its members."""
