@@ -409,6 +409,8 @@ def _gone(world: World, terms: tuple[Any, ...], *call: Any) -> list[Problem]:
 
 def prior_of(world: World) -> Array:
     """(s,) what is known of initial states beforehand, 1 sigma."""
+    if world.state_prior is not None:
+        return world.state_prior
     system, shown = world.simulator.system, set(world.channels)
     # a coordinate's samples show its rate, too; behind the rates an own system may have more
     pairs = dict(zip(system.rates, system.coordinates, strict=False))

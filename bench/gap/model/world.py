@@ -91,6 +91,8 @@ class World:
             (`bench.gap.prediction_error.candidate_responses`).
         identified: (b,) base parameters with which the filter follows a robot's runs; None where
             these are the nominal ones.
+        state_prior: (s,) standard deviations of initial states about their guesses, where a filter
+            follows a robot's runs.
         measured: of runs of a robot, states from readings alone
             (`bench.gap.prediction_error.measured_states`).
         crew: who simulates and fits; this process alone, unless another is put here.
@@ -165,6 +167,7 @@ class World:
         self.simulated: dict[tuple[str, bytes], Array] = {}
         self.followed: Any = None
         self.identified: Array | None = None
+        self.state_prior: Array | None = None
         self.measured: dict[int, Mapping[int, Array]] = {}
         self.simulations = 0
         self._cache = LaneCache()
@@ -421,6 +424,7 @@ class World:
         other.watch, other.crew = self.watch, self.crew
         other.followed, other.guess = self.followed, self.guess
         other.derivatives, other.identified = self.derivatives, self.identified
+        other.state_prior = self.state_prior
         self.crew.join(other)
         return other
 
@@ -536,6 +540,7 @@ class World:
         fine = np.isfinite(begun).all()
         self.guess = np.where(self.known | ~fine, self.guess, begun)
         self.derivatives = followed.state_sensitivities()
+        self.state_prior = followed.state_prior()
 
     def close(self) -> None:
         """Give back what the engine holds."""

@@ -358,6 +358,20 @@ class FollowedRuns:
             size = float(np.square(self.filtered.whitened).sum()) / max(self.runs.recorded.sum(), 1)
         return bool(size < UNSOUND)
 
+    def state_prior(self) -> Array | None:
+        """Return standard deviations (2 D,) of the first positions and velocities of the joints,
+        or None where other states are fitted besides.
+
+        A stiff servo forgets the first velocity within a sample. Without a limit a fit would make
+        it so large that the motion leaves the range of the linear model.
+        """
+        joints = len(self.linear[0].trajectory.x[0])
+        if len(self.world.states) != 2 * joints:
+            return None
+        own = self.runs.prior
+        velocities = own[self.linear[0].positions + np.arange(joints)] / VELOCITY_PRIOR
+        return np.concatenate([own[:joints], velocities])
+
     def first_positions(self) -> Array:
         """Return smoothed positions of the joints at the first samples (R, D)."""
         found = []

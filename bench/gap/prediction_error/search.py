@@ -39,7 +39,8 @@ from bench.gap.friction_form import (
 )
 from bench.gap.model.base_fit import costs_of_starts
 from bench.gap.model.bounds import coefficient_bounds
-from bench.gap.model.models import Model
+from bench.gap.model.fit import Fitter
+from bench.gap.model.models import STEPS, Model
 from bench.gap.model.problem import Fit, Known, Start
 from bench.gap.model.tangents import begun
 from bench.gap.prediction_error.candidate_responses import Columns, FollowedRuns
@@ -75,8 +76,14 @@ LINEARISATION_ERROR = 0.03
 """Share of a gain by which it may be wrong, since responses are linear."""
 MAX_RIVALS = 3
 """Maximum number of rivals of each effect that are fitted by simulation."""
+ALIKE_SHARE = 0.5
+"""Share of an effect's gain by regression that another one at the same joint must have to be
+followed in its place.
+"""
 MAX_STEPS = 4
 """Maximum number of effects that are added one after another."""
+FIRST_SHARE = 0.1
+"""Share of the stated friction that is first taken away where less of it is tried."""
 JOINT_MODEL = ("friction.coulomb", "drag.linear", "inertia.armature")
 """Effects at a joint that are always tried there."""
 SERVO_MODEL = ("actuator.stiffness", "actuator.damping")
@@ -525,6 +532,14 @@ class PredictionErrorSearch(Search):
                 step, gain = single_step(followed, number, bounds)
                 steps.append((gain, name, number, step))
         steps.sort(key=lambda one: -one[0])
+        friction = f"friction.coulomb@{place}"
+        if friction in world.library and friction not in names:
+            ((low, _),) = coefficient_bounds(world, friction)
+            if low < 0:
+                # Less friction than stated: not what a derivative by more of it tells.
+                start = theta.copy()
+                start[world.places(friction)[0]] = FIRST_SHARE * low
+                found.append((friction, start))
         for gain, name, number, step in steps[:MAX_JOINT_TRIALS]:
             if gain > 0.5 * self._penalty(name):
                 start = theta.copy()
@@ -775,9 +790,25 @@ class PredictionErrorSearch(Search):
                 starts.append(Start(names, theta, best.fit.states))
         if starts:
             self.refit(starts, race=False)
+        self._refine_near(best)
         size = len(best.names)
         fitted = [m for m in self.models.values() if len(m.names) == size]
         return max(fitted, key=lambda model: model.merit)
+
+    def _refine_near(self, best: Model) -> None:
+        """Fit the models that do nearly as well as the best one until nothing is left to gain, so
+        that what a fit has not reached does not decide between them.
+        """
+        size = len(best.names)
+        fitted = [m for m in self.models.values() if len(m.names) == size]
+        highest = max(m.merit for m in fitted)
+        near = [m for m in fitted if m.merit > highest - RIVAL_MARGIN]
+        if len(near) < 2 or self._must_end:
+            return
+        fitter = Fitter(self.world, self.noise, self.frozen, exact=True)
+        for model, fit in zip(near, fitter.fit([m.fit.start() for m in near], STEPS), strict=True):
+            if fit.cost < model.fit.cost:
+                self.enter(fit)
 
     def _find_rivals(self, model: Model, name: str) -> list[tuple[Group, Array, float]]:
         """The effects that do nearly as well in the place of one: the best group of columns of
@@ -790,17 +821,34 @@ class PredictionErrorSearch(Search):
         gains = rest.gains([]) - np.array([rest.price(group) for group in rest.groups])
         mine = rest.gain_of(own) - self._penalty(name)
         found: dict[str, tuple[Group, Array, float]] = {}
+        alike = self._joint_model_beside(name)
+        usual = 0
         for i in np.argsort(-gains, kind="stable").tolist():
             group = rest.groups[i]
             behind = mine - float(gains[i])
-            if behind > RIVAL_MARGIN + LINEARISATION_ERROR * mine or len(found) == MAX_RIVALS:
-                break
+            is_near = behind <= RIVAL_MARGIN + LINEARISATION_ERROR * mine and usual < MAX_RIVALS
+            # Of a large effect regression tells little: what acts at the same joint is tried.
+            is_alike = group.effect in alike and gains[i] > ALIKE_SHARE * mine
             if group.effect not in self.world.library or group.effect in (*model.names, *found):
                 continue
             # A law that contains this one never replaces it.
-            if name not in self.world.effects[group.effect].contains:
+            if (is_near or is_alike) and name not in self.world.effects[group.effect].contains:
+                usual += is_near
                 found[group.effect] = group, rest.solve([group])[1][0], behind
         return list(found.values())
+
+    def _joint_model_beside(self, name: str) -> set[str]:
+        """The effects of the standard joint model at the joint where an effect acts."""
+        count = len(self.world.simulator.system.coordinates)
+        joints = {j for j in range(count) if self._acts_at(name, {j})}
+        plain = (*JOINT_MODEL, *SERVO_MODEL)
+        return {
+            other
+            for other in self.world.library
+            if other.partition("@")[0] in plain
+            and not other.endswith("@*")
+            and self._acts_at(other, joints)
+        }
 
     def _start(self, groups: Sequence[Group], coefficients: Sequence[Array]) -> Start:
         """Where the fit of a set by simulation begins."""
