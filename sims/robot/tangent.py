@@ -100,7 +100,9 @@ class Tangent:
         self._share: Array = (numbers - at.numbers[at.of]) / at.every
         self._earlier, self._later = _neighbours(at.numbers, at.every)[:, at.of]
         self._base, self._read = at.reached({}, at.acting)
-        self.quotients = quotients or self._quotients()
+        # Other instants are looked at where commands change at other times.
+        alike = quotients is not None and quotients.states.shape[:2] == self._base.shape
+        self.quotients = quotients if quotients is not None and alike else self._quotients()
         # Accelerations and readings of the motion itself.
         self._still = at.accelerated(at.acting)
 

@@ -1,5 +1,6 @@
 """The linear model about a measured motion against simulations with an effect."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,36 @@ def test_a_sensor_effect_changes_readings_alone(world):
     column = world.channels.index("q.elbow")
     np.testing.assert_allclose(readings[:, column, 0], 0.01, atol=1e-7)
     assert not pushed.any()
+
+
+def test_a_gain_of_a_sensor_acts_on_what_is_predicted(world):
+    """Not on the reading itself, whose noise it would explain."""
+    linear = motion_with(world, world.nominal())
+    predicted = np.zeros((linear.knots.size, 2 * (len(world.states) // 2)))
+    elbow = world.channels.index("q.elbow")
+    predicted[:, world.simulator.system.coordinates.index("q.elbow")] = 0.2
+    _, readings = linear.added([(world.effects["sensor.gain@q.elbow"], np.array([0.5]))], predicted)
+    wanted = 0.5 * (linear.observed[:, elbow] + 0.2)
+    np.testing.assert_allclose(readings[:, elbow, 0], wanted, atol=1e-6)
+
+
+def test_jacobians_of_other_commands_are_not_used_again(world):
+    """Delayed steps change between samples, so that more instants are looked at."""
+    scenario, half = world.tracks[0].scenario, len(world.states) // 2
+    steps = {name: np.full_like(values, values[0]) for name, values in scenario.inputs.items()}
+    for values in steps.values():
+        for sample in (3, 8, 14, 21, 29):
+            values[sample:] += 0.06
+    scenario = replace(scenario, inputs=steps)
+    start = world.guess[0, :half], world.guess[0, half:]
+    nominal = MeasuredLinear(world.simulator, world.nominal(), scenario, start)
+    delayed = theta_of(world, "input.delay@m_shoulder", (0.013,))
+    given = delayed, scenario, start, nominal.trajectory
+    anew = MeasuredLinear(world.simulator, *given)
+    reused = MeasuredLinear(world.simulator, *given, nearby=nominal)
+    np.testing.assert_allclose(
+        reused.interval_maps().defects, anew.interval_maps().defects, atol=1e-4
+    )
 
 
 def test_maps_carry_a_deviation_as_the_simulator_does(world):
