@@ -215,6 +215,7 @@ class Fitter:
             steps=np.concatenate([FIRST_STEP * widths, state_steps]),
             exact=self.exact,
             rough=world.linear,
+            samples=int(world.counted(self.share).sum()),
         )
 
     def _points(self, trials: Sequence[_Trial], seen: Mask) -> list[Point]:

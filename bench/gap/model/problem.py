@@ -56,6 +56,10 @@ STAGNANT_RATIO = 0.3
 """Gain ratio (1) below which a robot's fit is stagnant, where it gains little as well."""
 STAGNANT_SHARE = 5e-3
 """What is little then, as a share of the sum of squares."""
+FAR = 2.0
+"""Sum of squares for each sample, in units of the noise, above which that ends a fit: what is
+nearer may still be right, and is compared with others.
+"""
 ROUGH_EXACT = 1.0
 """The same of a fit whose numbers are told."""
 
@@ -166,6 +170,7 @@ class Problem:
         waits: whether that can wait until it is known that it is not far behind.
         exact: whether it goes on until `EXACT`.
         rough: whether its cost is not smooth at the scale of the noise.
+        samples: number of samples that count.
     """
 
     point: Point
@@ -183,12 +188,14 @@ class Problem:
     waits: bool = False
     exact: bool = False
     rough: bool = False
+    samples: int = 0
 
     def enough(self, cost: float) -> float:
         """By less than this a step need not lower the cost."""
         if self.exact:
             return EXACT
-        return ENOUGH + (ROUGH_SHARE if self.rough else SHARE) * cost
+        coarse = self.rough and cost > FAR * self.samples
+        return ENOUGH + (ROUGH_SHARE if coarse else SHARE) * cost
 
     def fit(self) -> Fit:
         """What has been fitted by now."""
@@ -251,7 +258,8 @@ class Problem:
         factor = max(LEAST_FACTOR, 1.0 - (2.0 * ratio - 1.0) ** 3)
         self.damping = max(self.damping * factor, LEAST_DAMPING)  # (2)
         self.growth = GROWTH
-        stagnant = ratio < STAGNANT_RATIO and gained < STAGNANT_SHARE * cost
+        far = cost > FAR * self.samples
+        stagnant = far and ratio < STAGNANT_RATIO and gained < STAGNANT_SHARE * cost
         if self.rough and not self.exact and own and stagnant:
             self.done = True
         # With derivatives of its own it has converged; with others it may have.

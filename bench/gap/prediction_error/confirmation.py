@@ -87,6 +87,9 @@ class Confirmation(Inquiry):
         search, model = self._robot, self._model
         self._watch.begin("held_out")
         names = set(model.names)
+        if len(names) > 1:
+            for name in model.names:
+                search.without(model, name)
         parts = [m for m in search.models.values() if set(m.names) < names and m.names]
         size = len(names)
         rivals = [m for m in search.models.values() if len(m.names) == size and m is not model]

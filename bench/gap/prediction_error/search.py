@@ -195,7 +195,8 @@ class PredictionErrorSearch(Search):
             best.setdefault(probes[i].effect, i)
         self.refit([starts[i] for i in best.values()], race=False)
         fitted = [self.models[frozenset((name,))] for name in best]
-        return max(fitted, key=lambda model: model.merit)
+        likeliest = max(fitted, key=lambda model: model.merit)
+        return self._fit(likeliest.fit.start())
 
     def _has_series(self, model: Model) -> bool:
         """Whether a model has joints in series with others, and so states of its own."""
@@ -741,9 +742,13 @@ class PredictionErrorSearch(Search):
         found = self.models[frozenset(start.effects)]
         if self._is_explained(found) or not np.isfinite(found.fit.cost):
             return found
+        before = self.world.derivatives
         begun(self.world, found.fit.theta, found.fit.states, anew=True)
         self.refit([found.fit.start()], race=False)
         found = self.models[frozenset(start.effects)]
+        if not self._is_explained(found):
+            # Those about a motion that is wrong hold for no other model.
+            self.world.derivatives = before
         for name in found.names:
             if has_dry_friction(self.world, [name]) and not self._is_explained(found):
                 found = self._fit_nearby(found, name)
