@@ -6,14 +6,29 @@ microseconds whatever their size. Compiled code is kept in the user's cache by n
 
 from __future__ import annotations
 
+import importlib.util
 from typing import Any
 
-import numba
 import numpy as np
 
 from sims.base import Array
 
-_compiled: Any = numba.njit(cache=True, error_model="numpy", nogil=True)
+
+def _compiled(function: Any) -> Any:
+    """Compile a function, and keep the code where there is a place for it.
+
+    Where numba does not support this Python, the function runs as it is, a hundred times slower.
+    """
+    if importlib.util.find_spec("numba") is None:
+        return function
+    import numba
+
+    settings: dict[str, Any] = {"error_model": "numpy", "nogil": True}
+    try:
+        return numba.njit(cache=True, **settings)(function)
+    except RuntimeError:
+        # Neither the folder of the package nor the user's cache can be written.
+        return numba.njit(**settings)(function)
 
 
 def _product(a: Array, b: Array, out: Array) -> None:
