@@ -100,7 +100,11 @@ MAX_CACHED_FILTERS = 6
 """Number of filters that are kept for effects that were tried."""
 MAX_TRIALS = 4
 """Maximum number of effects that are tried in the model at each step."""
-BEST_TRIALS = 2
+ALL_SERVOS_STEPS = 6
+"""Maximum number of Gauss-Newton steps for the numbers of all servos."""
+MAX_BEGINNINGS = 2
+"""Number of effects with which sets are begun."""
+BEST_TRIALS = 3
 """Number of these whose coefficients are improved."""
 SOFT_FACTORS = (1.0, 2.0, 4.0)
 """Multiples of the stiff friction that are tried in the soft form, which is weaker at low speed."""
@@ -362,40 +366,80 @@ class PredictionErrorSearch(Search):
             for name in names:
                 theta[self.world.slots[name]] = own[self.world.slots[name]]
             theta, followed, likelihood = self._follow_with(theta, names)
-        alone: list[_Tried] = []
-        for step in range(MAX_STEPS):
-            tried = self._try_one_more(followed, theta, names)
-            if not step and not names:
-                alone = tried
-            if not tried or 2.0 * (tried[0].likelihood - likelihood) < self._penalty(tried[0].name):
+        first = self._try_one_more(followed, theta, names)
+        gains = [
+            one for one in first if 2.0 * (one.likelihood - likelihood) >= self._penalty(one.name)
+        ]
+        if not gains:
+            if not names:
+                return self.base
+            return self._judged_in_model(self._fit(self._start_of(followed, theta, names)))
+        fitted = self.base
+        for one in gains[:MAX_BEGINNINGS]:
+            # Two effects may do together what none does alone: the second best is also begun with.
+            fitted = self._of_higher_merit(fitted, self._grow(one, names))
+            if not self._is_explained(fitted) and not names:
+                # Filters of two effects may be as likely where their simulations are not.
+                alone = self._fit(self._start_of(one.followed, one.theta, [one.name]))
+                fitted = self._of_higher_merit(fitted, alone)
+            if self._is_explained(fitted) or names or self._must_end:
                 break
-            theta, followed, likelihood, name = tried[0]
-            contained = self.world.effects[name].contains
-            names = [n for n in names if n not in contained] + [name]
-            if not (followed.losses_without_force > MIN_LOSS_WITHOUT_FORCE).any():
-                break
-        if not names:
+        if not self._is_explained(fitted) and not names and not self._must_end:
+            fitted = self._of_higher_merit(fitted, self._fit_all_servos())
+        return self._judged_in_model(fitted)
+
+    def _fit_all_servos(self) -> Model:
+        """Fit stiffness and damping of all servos together, where forces are missing at several
+        joints: one of them without the other may gain less than what imitates both.
+        """
+        names = [f"{effect}@*" for effect in SERVO_MODEL]
+        lacking = self.follow().losses_without_force > MIN_LOSS_WITHOUT_FORCE
+        if lacking.sum() < 2 or any(name not in self.world.library for name in names):
             return self.base
-        fitted = self._fit(Start(tuple(names), theta, self._first_states(followed)))
-        if not self._is_explained(fitted):
-            # Filters of two effects at one joint may be as likely where their simulations are not.
-            starts = [
-                Start((one.name,), one.theta, self._first_states(one.followed)) for one in alone
-            ]
-            fits = [self._fit(start) for start in starts if start.effects != fitted.names]
-            fitted = max([fitted, *fits], key=lambda model: model.merit)
-        if not np.isfinite(fitted.fit.cost):
+        theta, followed, _ = self._follow_with(self._reference, names, ALL_SERVOS_STEPS)
+        return self._fit(self._start_of(followed, theta, names))
+
+    def _start_of(self, followed: FollowedRuns, theta: Array, names: Sequence[str]) -> Start:
+        """Where the fit of a set begins whose filter is known."""
+        return Start(tuple(names), theta, self._first_states(followed))
+
+    def _judged_in_model(self, fitted: Model) -> Model:
+        """Return what is left of a fitted set without idle effects.
+
+        Raises:
+            SoftFrictionError: its dry friction is likelier in MuJoCo's soft form.
+        """
+        if not np.isfinite(fitted.fit.cost) or not fitted.names:
             return self.base
         if not self._is_explained(fitted) and is_likelier_soft(self, fitted, SWITCH):
             raise SoftFrictionError
         return self._without_idle_effects(fitted)
+
+    def _grow(self, first: _Tried, names: Sequence[str]) -> Model:
+        """Add effects to a first one while each pays, and fit the set by simulation."""
+        theta, followed, likelihood, name = first
+        names = [*self._beside(names, name), name]
+        for _ in range(MAX_STEPS - 1):
+            if not (followed.losses_without_force > MIN_LOSS_WITHOUT_FORCE).any():
+                break
+            tried = self._try_one_more(followed, theta, names)
+            if not tried or 2.0 * (tried[0].likelihood - likelihood) < self._penalty(tried[0].name):
+                break
+            theta, followed, likelihood, name = tried[0]
+            names = [*self._beside(names, name), name]
+        return self._fit(self._start_of(followed, theta, names))
+
+    def _beside(self, names: Sequence[str], name: str) -> list[str]:
+        """The effects of a set that another effect does not contain."""
+        contained = self.world.effects[name].contains
+        return [n for n in names if n not in contained]
 
     def _try_one_more(
         self, followed: FollowedRuns, theta: Array, names: Sequence[str]
     ) -> list[_Tried]:
         """Follow the runs with each effect that gains most in addition to the model.
 
-        Return the likeliest two, the likelier first; none where no effect gains.
+        Return the likeliest, the likelier first; none where no effect gains.
         """
         watch, tried = self.world.watch, list[_Tried]()
         watch.stage("testing effects in the model one by one", MAX_TRIALS)
@@ -403,7 +447,7 @@ class PredictionErrorSearch(Search):
             tried.append(_Tried(*self._follow_with(start, [*names, name], turns=0), name))
             watch.advance()
             watch.check()
-        # The coefficients of the best two are improved before they are compared.
+        # The coefficients of the best are improved before they are compared.
         tried.sort(key=self._unlikeliness)
         tried = [
             _Tried(*self._follow_with(one.theta, [*names, one.name]), one.name)
