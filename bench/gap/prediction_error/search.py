@@ -51,6 +51,7 @@ from bench.gap.prediction_error.selection import Regression
 from sims.base import Array
 from sims.robot.forces import OVER_TIME
 from sims.robot.native import FIELDS
+from sims.robot.scales import scales
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
 from sims.simulated import Simulated
@@ -557,6 +558,7 @@ class PredictionErrorSearch(Search):
         for a light joint, and where an offset changes the pose.
         """
         world = self.world
+        assert isinstance(world.simulator, RobotSimulator)
         coordinates = world.simulator.system.coordinates
         joint = int(np.argmax(followed.losses_without_force[: len(coordinates)]))
         place = coordinates[joint].removeprefix("q.")
@@ -585,10 +587,17 @@ class PredictionErrorSearch(Search):
                 start = theta.copy()
                 start[world.places(friction)[0]] = FIRST_SHARE * low
                 found.append((friction, start))
+        speed = max(float(np.abs(one.trajectory.v[:, joint]).max()) for one in followed.linear)
+        usual = {
+            f"drag.linear@{place}": FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9),
+            f"inertia.armature@{place}": float(scales(world.simulator.robot).inertia[joint]),
+        }
         for gain, name, number, step in steps[:MAX_JOINT_TRIALS]:
-            if gain > 0.5 * self._penalty(name):
+            # Where much process noise hides an effect, a typical size shows it.
+            first = step if gain > 0.5 * self._penalty(name) else usual.get(name, 0.0)
+            if first:
                 start = theta.copy()
-                start[number] += step
+                start[number] += first
                 found.append((name, start))
         return found
 
