@@ -306,6 +306,7 @@ class _Explainer:
         world.crew = self.crew
         self.crew.join(world)
         use_bounds(world, {name: bounds for name, (_, bounds) in self.wider.items()})
+        world.identified = self.identified
         return world
 
     def _takes_no_effects(self) -> InputError:
@@ -510,7 +511,7 @@ class _Explainer:
         for world in self._worlds():
             self.watch.stage("following the runs with the model")
             followed.append(FollowedRuns.follow(world, world.nominal(), self.noise, None))
-        # Where the linear model explodes, causes are searched by simulation.
+        # Where the linear model diverges, causes are searched by simulation.
         if not all(one.is_sound for one in followed):
             return
         if self.free_numbers and self.tuner is None:
@@ -525,10 +526,9 @@ class _Explainer:
 
         world = self.fitting
         declared = {p.name: p.bounds for p in world.parameters}
-        found = identify_base(world, self.noise, followed)
+        found, wider = identify_base(world, self.noise, followed)
         if found is not followed:
-            self.identified = found.theta[world.base]
-        wider = {p.name: p.bounds for p in world.parameters if p.bounds != declared[p.name]}
+            self.identified = world.identified = found.theta[world.base]
         self._widen(wider, declared)
         return found
 
@@ -615,7 +615,7 @@ class _Explainer:
                 continue
             self._enter(fine.kind)
             if self.fitting.followed is None:
-                # A model that explodes with the file's step may be followed with a finer one.
+                # A model that diverges with the file's step may be followed with a finer one.
                 self._follow()
             other = fit_base(self.fitting, self.noise, self._nearby(base))
             reached, left = self._judged(other)

@@ -10,7 +10,6 @@ chapter 4) as well as from one through every second sample.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,30 +32,26 @@ FEWEST = 40
 """Smallest number of samples that each run must keep."""
 
 
-class Thinned(NamedTuple):
-    """A recording with fewer samples, and a message for the user; empty where it is unchanged."""
-
-    recording: Recording
-    note: str
-
-
-def thin(recording: Recording, kind: type[Simulator]) -> Thinned:
-    """Keep each k-th sample of a robot's recording, where these hold all of the motion.
+def thin(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
+    """Keep each k-th sample of a robot's recording, where these samples contain all motion.
 
     Inputs that are held take their mean between the samples that are kept.
+
+    Returns:
+        The recording, and a message for the user, which is empty where it is unchanged.
     """
     rate = min((_rate(run) for run in recording.runs), default=0.0)
     if not kind.has_model or rate <= FASTEST:
-        return Thinned(recording, "")
+        return recording, ""
     every = next((k for k in range(round(rate / SLOWEST), 1, -1) if _holds(recording, k)), 1)
     if every == 1:
-        return Thinned(recording, "")
+        return recording, ""
     runs = tuple(_thinned(run, every) for run in recording.runs)
     note = (
         f"sampled at {rate:.4g} Hz, faster than it moves: each sample of {every} is used, "
         "and the mean of the inputs between them"
     )
-    return Thinned(replace(recording, runs=runs), note)
+    return replace(recording, runs=runs), note
 
 
 def _rate(run: Run) -> float:

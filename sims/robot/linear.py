@@ -5,6 +5,7 @@ sensors would show it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from sims.robot.scales import floating_forces, scales
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
 from sims.robot.tangent import TOGETHER, Change, Quotients, Tangent
-from sims.robot.work import Work
+from sims.robot.work import Given, Work
 from sims.simulated import Simulated
 from sims.system import Acting, Effect, Input, Sensor
 
@@ -97,14 +98,20 @@ class Linear:
             x=np.concatenate([made.x[0], made.series[0][0]], axis=1),
             v=np.concatenate([made.v[0], made.series[1][0]], axis=1),
             act=np.concatenate([first, act[:-1]]),
-            controls=controls,
-            forces=wide.spread(given.forces[0]),
-            instant=given.instant[0],
-            inputs={name: u[0] for name, u in given.felt.items()},
             carried=carried,
             afloat=self._afloat(made.fields),
             step=simulator.step,
+            **self._commanded(given),
         )
+
+    def _commanded(self, given: Given) -> dict[str, Any]:
+        """Return the fields of a motion that follow from the commands of the run."""
+        return {
+            "controls": given.controls[0],
+            "forces": self._simulator.wide(self._work.acting).spread(given.forces[0]),
+            "instant": given.instant[0],
+            "inputs": {name: u[0] for name, u in given.felt.items()},
+        }
 
     def _afloat(self, fields: Mapping[str, Array]) -> Afloat:
         """What floats, at the beginnings of steps and at the end."""

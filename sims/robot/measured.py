@@ -172,14 +172,7 @@ class MeasuredLinear(Linear):
         if not alone or any(is_series(effect) for effect, _ in self._work.acting):
             return None
         self._readings = dict(self._nearby._readings)
-        given = self._simulator.controls(self._work, steps)
-        return replace(
-            motion,
-            controls=given.controls[0],
-            forces=self._simulator.wide(self._work.acting).spread(given.forces[0]),
-            instant=given.instant[0],
-            inputs={name: u[0] for name, u in given.felt.items()},
-        )
+        return replace(motion, **self._commanded(self._simulator.controls(self._work, steps)))
 
     def _from_samples(self, motion: Motion) -> Trajectory:
         """Interpolate the measured joints between samples by quintic Hermite polynomials."""
@@ -278,7 +271,6 @@ class MeasuredLinear(Linear):
         means = np.zeros((samples - 1, inputs, count), dtype=np.float32)
         readings = np.zeros((samples, self.observed.shape[1], count), dtype=np.float32)
         driven = self._driven([(e, c) for e, c in effects])
-        moved: Array | None = None
         for begin in range(0, count, BLOCK):
             part = range(begin, min(begin + BLOCK, count))
             changes: list[Change] = []
@@ -296,11 +288,7 @@ class MeasuredLinear(Linear):
             with np.errstate(all="ignore"):
                 pushed, read = self._tangent.pushed(changes, len(part))
                 means[:, :, own] = self._means(pushed)
-                if moved is None and any(sensors):
-                    moved = self.propagated(
-                        predicted, np.zeros((samples - 1, quotients.forces.shape[2]))
-                    )
-                readings[:, :, own] = self._read_directly(read, sensors, moved)
+                readings[:, :, own] = self._read_directly(read, sensors, predicted)
         return means, readings
 
     def _means(self, pushed: Array) -> Array:
@@ -324,27 +312,27 @@ class MeasuredLinear(Linear):
             result[active] = quotients.states[looked] @ result[active] + by[looked]
         return result
 
-    def _read_directly(
-        self, read: Array, sensors: Sequence[Acting], predicted: Array | None
-    ) -> Array:
-        """Return ψ (T, C, K) from changes of readings (S, O, K) and from sensors' effects on
-        predicted deviations of the state (S + 1, Z).
+    def _read_directly(self, read: Array, sensors: Sequence[Acting], predicted: Array) -> Array:
+        """Return ψ (T, C, K) from changes of readings (S, O, K), and from sensors' effects on
+        readings of the predicted deviations (T, Z).
         """
         result = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
-        shape = self._motion.x.shape[0], self._tangent.size
-        changed = [k for k, acting in enumerate(sensors) if not acting and read[:, :, k].any()]
-        if changed:
-            nothing = np.zeros((len(changed), *shape))
-            unsensed: list[Acting] = [()] * len(changed)
-            seen = self._seen(nothing, np.moveaxis(read[:, :, changed], 2, 0), unsensed)
-            result[:, :, changed] = np.moveaxis(seen - self.observed, 0, 2)
-        sensed = [k for k, acting in enumerate(sensors) if acting]
-        if sensed and predicted is not None:
-            states = np.broadcast_to(predicted, (len(sensed) + 1, *shape))
-            changes = np.zeros((len(sensed) + 1, *read.shape[:2]))
-            changes[:-1] = np.moveaxis(read[:, :, sensed], 2, 0)
-            seen = self._seen(states, changes, [*(sensors[k] for k in sensed), ()])
-            result[:, :, sensed] = np.moveaxis(seen[:-1] - seen[-1], 0, 2)
+        some = [k for k, acting in enumerate(sensors) if acting or read[:, :, k].any()]
+        if not some:
+            return result
+        sensed = np.array([bool(sensors[k]) for k in some])
+        # The last one has no effect: it is what the sensors' effects are compared with.
+        states = np.zeros((len(some) + 1, self._motion.x.shape[0], self._tangent.size))
+        if sensed.any():
+            forces = self._tangent.quotients.forces.shape[2]
+            unforced = np.zeros((self.knots.size - 1, forces))
+            states[np.append(sensed, True)] = self.propagated(predicted, unforced)
+        changes = np.concatenate(
+            [np.moveaxis(read[:, :, some], 2, 0), np.zeros((1, *read.shape[:2]))]
+        )
+        seen = self._seen(states, changes, [*(sensors[k] for k in some), ()])
+        plain = np.where(sensed[:, None, None], seen[-1], self.observed)
+        result[:, :, some] = np.moveaxis(seen[:-1] - plain, 0, 2)
         return result
 
     def propagated(self, begun: Array, forces: Array) -> Array:

@@ -100,9 +100,10 @@ class Tangent:
         self._share: Array = (numbers - at.numbers[at.of]) / at.every
         self._earlier, self._later = _neighbours(at.numbers, at.every)[:, at.of]
         self._base, self._read = at.reached({}, at.acting)
-        # Other instants are looked at where commands change at other times.
-        alike = quotients is not None and quotients.states.shape[:2] == self._base.shape
-        self.quotients = quotients if quotients is not None and alike else self._quotients()
+        # Where commands change at other times, quotients are taken at other instants.
+        if quotients is None or quotients.states.shape[:2] != self._base.shape:
+            quotients = self._quotients()
+        self.quotients = quotients
         # Accelerations and readings of the motion itself.
         self._still = at.accelerated(at.acting)
 

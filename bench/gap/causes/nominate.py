@@ -64,7 +64,7 @@ def nominated(
         for peak, (group, scored) in enumerate(scores.peaks[i]):
             known = _known(world, model, found, group, name)
             for c in _sizes(world, found, group, scored, name):
-                start = replace(_with(world, model, name, c), known=known)
+                start = replace(with_effect(world, model.fit.start(), name, c), known=known)
                 numbered.append((peak, start))
     # In patience the fit begins with the first part of the runs, so the nearest is asked there.
     share = HORIZONS[0].share if patient else 1.0
@@ -103,18 +103,25 @@ def _promising(
     return good + whole
 
 
-def _with(world: World, model: Model, name: str, c: Array) -> Start:
-    """The model with one more effect, which takes the place of those that it contains."""
+def with_effect(world: World, start: Start, name: str, c: Array) -> Start:
+    """Add an effect to a model, in place of the effects that it contains.
+
+    Args:
+        world: the runs.
+        start: the model.
+        name: of the effect.
+        c: (k,) its coefficients.
+    """
     effect = world.effects[name]
-    contained, theta = effect.contains, model.fit.theta.copy()
+    contained, theta = effect.contains, start.theta.copy()
     # Both at once would share what they explain in any way.
-    for part in sorted(set(contained) & set(model.names)):
+    for part in sorted(set(contained) & set(start.effects)):
         own = world.slots[part]
         c = effect.taking(c, part, theta[own])
         theta[own] = 0.0
     theta[world.slots[name]] = c
-    rest = [n for n in model.names if n not in contained]
-    return Start((*rest, name), theta, model.fit.states)
+    rest = [n for n in start.effects if n not in contained]
+    return Start((*rest, name), theta, start.states)
 
 
 def _known(world: World, model: Model, found: Directions, group: Group, name: str) -> Known | None:

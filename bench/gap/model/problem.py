@@ -44,24 +44,22 @@ EXACT = 0.002
 a twentieth of what noise makes of them.
 """
 
-ROUGH_SHARE = 1e-3
-"""The share of the sum of squares of a robot's fit, whose cost is rough: a joint that begins to
-stick one step of the integrator later moves by more than the fit could still gain.
-"""
-ROUGH = 3.0
-"""A robot's fit has converged where a step that promised less than this, with derivatives of the
-very point, gains nothing: the cost is rougher than what is left to gain.
-"""
-STAGNANT_RATIO = 0.3
-"""Gain ratio (1) below which a robot's fit is stagnant, where it gains little as well."""
-STAGNANT_SHARE = 5e-3
-"""What is little then, as a share of the sum of squares."""
+# The cost of a robot's fit is rough: a joint that sticks one integration step later changes it by
+# more than the fit can still gain. These constants end such fits.
+COARSE_SHARE = 1e-3
+"""Convergence threshold as a share of the sum of squares, where the model is far from the data."""
 FAR = 2.0
-"""Sum of squares for each sample, in units of the noise, above which that ends a fit: what is
-nearer may still be right, and is compared with others.
+"""A model is far from the data above this mean squared residual, in units of the noise."""
+STAGNANT_RATIO = 0.3
+"""Maximum gain ratio (1) of a step that ends a fit far from the data."""
+STAGNANT_SHARE = 5e-3
+"""Maximum gain of such a step, as a share of the sum of squares."""
+ROUGHNESS = 3.0
+"""A fit has converged where a step with derivatives of its own point promises less than this, in
+units of the noise, and gains nothing.
 """
-ROUGH_EXACT = 1.0
-"""The same of a fit whose numbers are told."""
+EXACT_ROUGHNESS = 1.0
+"""The value of `ROUGHNESS` for fits whose parameters are reported."""
 
 FIRST_DAMPING = 1e-3
 """Where the λ of (2) begins."""
@@ -194,8 +192,11 @@ class Problem:
         """By less than this a step need not lower the cost."""
         if self.exact:
             return EXACT
-        coarse = self.rough and cost > FAR * self.samples
-        return ENOUGH + (ROUGH_SHARE if coarse else SHARE) * cost
+        return ENOUGH + (COARSE_SHARE if self._is_far(cost) else SHARE) * cost
+
+    def _is_far(self, cost: float) -> bool:
+        """Whether a rough fit is far from the data."""
+        return self.rough and cost > FAR * self.samples
 
     def fit(self) -> Fit:
         """What has been fitted by now."""
@@ -253,14 +254,13 @@ class Problem:
             cost: to which.
             own: whether the derivatives were those of the very point where the step began.
         """
-        self.stale = not self.here and abs(gained / max(self.promised, 1e-300) - 1.0) > KEPT
         ratio = gained / max(self.promised, 1e-300)  # (1)
+        self.stale = not self.here and abs(ratio - 1.0) > KEPT
         factor = max(LEAST_FACTOR, 1.0 - (2.0 * ratio - 1.0) ** 3)
         self.damping = max(self.damping * factor, LEAST_DAMPING)  # (2)
         self.growth = GROWTH
-        far = cost > FAR * self.samples
-        stagnant = far and ratio < STAGNANT_RATIO and gained < STAGNANT_SHARE * cost
-        if self.rough and not self.exact and own and stagnant:
+        stagnant = ratio < STAGNANT_RATIO and gained < STAGNANT_SHARE * cost
+        if own and not self.exact and stagnant and self._is_far(cost):
             self.done = True
         # With derivatives of its own it has converged; with others it may have.
         if gained < self.enough(cost):
@@ -271,7 +271,7 @@ class Problem:
         if not self.here:
             self.stale = True
             return
-        if self.rough and self.promised < (ROUGH_EXACT if self.exact else ROUGH):
+        if self.rough and self.promised < (EXACT_ROUGHNESS if self.exact else ROUGHNESS):
             self.done = True
             return
         self.damping = self.damping * GROWTH * self.growth

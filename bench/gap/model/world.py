@@ -89,8 +89,8 @@ class World:
         simulated: what effects without a tangent change about them, by name and coefficients.
         followed: the runs of a robot as a filter follows them, if it does
             (`bench.gap.prediction_error.candidate_responses`).
-        identified: (b,) base parameters with which the filter follows a robot's runs; None where
-            these are the nominal ones.
+        identified: (b,) base parameters of a robot that prediction errors identify; None where they
+            identify none.
         state_prior: (s,) standard deviations of initial states about their guesses, where a filter
             follows a robot's runs.
         measured: of runs of a robot, states from readings alone
@@ -534,8 +534,6 @@ class World:
             followed: `bench.gap.prediction_error.candidate_responses.FollowedRuns`.
         """
         self.followed = followed
-        base, nominal = followed.theta[self.base], self.nominal()[self.base]
-        self.identified = None if np.array_equal(base, nominal) else base
         begun = followed.first_states()
         fine = np.isfinite(begun).all()
         self.guess = np.where(self.known | ~fine, self.guess, begun)

@@ -30,6 +30,7 @@ from bench.gap.prediction_error.state_estimation import (
     SMALLEST_FORCE,
     Filtered,
     LinearRuns,
+    Mask,
     Places,
     Smoothed,
     filter_runs,
@@ -63,6 +64,8 @@ COLOURED = 5.0
 """Log likelihood that a larger correlation must gain."""
 UNSOUND = 100.0
 """Mean square of the whitened innovations above which a linear model does not follow the runs."""
+MIN_LOSS_WITHOUT_FORCE = 20.0
+"""Twice the log likelihood that must be lost without process noise for a force to be missing."""
 SIDE_BY_SIDE = 256
 """Number of columns that go through the filter together, so that they stay in the cache."""
 
@@ -163,16 +166,9 @@ class FollowedRuns:
         for _ in range(again):
             # Jacobians change little from one motion to another near the data.
             nearby: Sequence[MeasuredLinear | None] = linear or [None] * len(world.tracks)
+            motion: Sequence[Trajectory | None] = trajectories or [None] * len(world.tracks)
             linear = [
-                _linearised(
-                    world,
-                    theta,
-                    noise,
-                    run,
-                    None if trajectories is None else trajectories[run],
-                    near,
-                    simulator,
-                )
+                _linearised(world, theta, noise, run, motion[run], near, simulator)
                 for run, near in enumerate(nearby)
             ]
             maps = [one.interval_maps() for one in linear]
@@ -214,12 +210,10 @@ class FollowedRuns:
         """Return the whitened innovations (R, T, C) of a model with parameters nearby, filtered
         about the same motion with the same process noise.
         """
-        motion = [linear.trajectory for linear in self.linear]
-        linear = [
-            _linearised(self.world, theta, self.noise, run, motion[run], near)
+        maps = [
+            _linearised(self.world, theta, self.noise, run, near.trajectory, near).interval_maps()
             for run, near in enumerate(self.linear)
         ]
-        maps = [one.interval_maps() for one in linear]
         runs = LinearRuns.stacked(maps, self.world.observed, self.runs.prior)
         coloured, white = with_coloured_noise(runs, self.noise)
         return filter_runs(coloured, self.force, white).whitened
@@ -241,6 +235,19 @@ class FollowedRuns:
             found = filter_runs(coloured, force, white)
             losses.append(2.0 * (best - float(found.log_likelihood.sum())))
         return np.array(losses)
+
+    @property
+    def missing_forces(self) -> Mask:
+        """(E,) whether the model lacks a force: the filter needs process noise there."""
+        mask: Mask = self.losses_without_force > MIN_LOSS_WITHOUT_FORCE
+        return mask
+
+    @property
+    def joints_by_loss(self) -> list[int]:
+        """Numbers of the joints, that with the largest loss without process noise first."""
+        joints = len(self.world.simulator.system.coordinates)
+        order: list[int] = np.argsort(-self.losses_without_force[:joints], kind="stable").tolist()
+        return order
 
     @property
     def step(self) -> float:
@@ -310,7 +317,7 @@ class FollowedRuns:
         sizes: SingleArray = columns.sizes.astype(np.float32)
         with np.errstate(all="ignore"):
             result: SingleArray = found[..., columns.places] / sizes
-        # A response of a candidate with which the motion explodes is none.
+        # A candidate with which the motion diverges has no response.
         result[~(np.abs(result) < LARGEST)] = 0.0
         return result
 
@@ -458,7 +465,7 @@ def _fit_noise(runs: LinearRuns, noise: Noise, force: Array, typical: Array) -> 
         if best is not None:
             found = filter_runs(coloured, best.force, white)
             before, after = best.filtered.log_likelihood.sum(), found.log_likelihood.sum()
-            # Both are minus infinity where the model explodes.
+            # Both are minus infinity where the model diverges.
             if not after > before + COLOURED:
                 break
             force = best.force
@@ -476,7 +483,7 @@ def _linearised(
     nearby: MeasuredLinear | None,
     simulator: RobotSimulator | None = None,
 ) -> MeasuredLinear:
-    """Linearise the model of one run about a motion, at first that of its readings alone."""
+    """Linearise the model of one run about a motion; None stands for that of its readings alone."""
     half = len(world.states) // 2
     scenario = world.tracks[run].scenario
     start = world.guess[run, :half], world.guess[run, half:]

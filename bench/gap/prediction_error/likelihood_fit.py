@@ -3,7 +3,7 @@
 A simulation that begins far from the right parameters leaves the data within a second, and a fit to
 it has many local minima. A filter stays near the data whatever the parameters are, so that its
 innovations are nearly linear in them (L. Ljung, System Identification, 2nd ed., 1999, chapter 10).
-What is found is where a fit by simulation begins.
+Its estimates are the initial values of a fit by simulation.
 
 Derivatives are differences of the innovations of whole filters. Responses about the measured
 accelerations contain the noise of the innovations that they are to explain, which biases a step.
@@ -31,7 +31,7 @@ ITERATIONS = 8
 DIFFERENCE = 1e-3
 """Share of a parameter's plausible range by which it is moved for its derivative."""
 LEAST_GAIN = 1.0
-"""Log likelihood that a step must gain for another one to follow."""
+"""Log likelihood that a step must gain for another step to follow."""
 HALVINGS = 3
 """Number of times a step that gains nothing is halved."""
 RESISTANCE = ("friction.coulomb", "drag.linear", "force.bias")
@@ -40,27 +40,26 @@ MAX_JOINTS = 3
 """Maximum number of joints at which they are."""
 RIDGE = 1e-9
 """Ridge of the normal equations, as a share of each parameter's sum of squares."""
-MISSING = 20.0
-"""Twice the log likelihood that must be lost without process noise for a force to be missing."""
 CLEAR = 2.0
 """Log likelihood that base parameters must gain over the nominal ones."""
 
 
-def identify_base(world: World, noise: Noise, followed: FollowedRuns) -> FollowedRuns:
+def identify_base(
+    world: World, noise: Noise, followed: FollowedRuns
+) -> tuple[FollowedRuns, dict[str, Bounds]]:
     """Identify the base parameters of a robot from the innovations of a filter.
 
-    Friction and constant forces of the joints where a force is missing are fitted beside them, and
-    left out again: a mass without them would stand for them. The range of a parameter whose
-    estimate lies outside is widened to contain it.
+    Where they leave a force missing, friction and constant forces at the joints are fitted with
+    them and then set to zero again. Without these a mass would be estimated too large.
 
     Args:
-        world: the runs for fitting.
+        world: the runs for fitting; ranges that do not contain an estimate are replaced.
         noise: of the sensors.
         followed: the runs, filtered with the nominal parameters.
 
     Returns:
-        The runs, filtered with the parameters that were found; those of before where nothing gains
-        or a parameter ends at the widest bound.
+        The runs, filtered with the estimates, and the new ranges by name. The filter with nominal
+        parameters where the likelihood gains nothing or an estimate is at its widest bound.
     """
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
@@ -78,27 +77,26 @@ def identify_base(world: World, noise: Noise, followed: FollowedRuns) -> Followe
         ends = [bound_of(float(tried.theta[i]), *b) for i, b in zip(places, limits, strict=True)]
         if tried.is_sound and not any(ends):
             found.append(tried)
-        # What friction could stand for is explained by the base parameters alone.
-        if found and (tried.losses_without_force < MISSING).all():
+        # The base parameters alone leave no force missing, so friction is not needed.
+        if found and not tried.missing_forces.any():
             break
     best = max(found, key=lambda one: one.log_likelihood, default=followed)
     if best.log_likelihood - followed.log_likelihood < CLEAR:
-        return followed
+        return followed, {}
     values = {i: float(best.theta[i]) for i in places}
     outside = {i: v for i, v in values.items() if not _is_within(world.parameters[i].bounds, v)}
     wider = {world.parameters[i].name: range_around(world, i, v) for i, v in outside.items()}
     use_bounds(world, wider)
     theta = followed.theta.copy()
     theta[places] = best.theta[places]
-    return follow(theta, best)
+    return follow(theta, best), wider
 
 
 def _resistance(followed: FollowedRuns) -> list[str]:
     """Effects that resist the motion of the joints where most is missing."""
     world = followed.world
     coordinates = world.simulator.system.coordinates
-    losses = followed.losses_without_force[: len(coordinates)]
-    joints = [coordinates[j].removeprefix("q.") for j in np.argsort(-losses)[:MAX_JOINTS].tolist()]
+    joints = [coordinates[j].removeprefix("q.") for j in followed.joints_by_loss[:MAX_JOINTS]]
     names = [f"{effect}@{joint}" for joint in joints for effect in RESISTANCE]
     return [name for name in names if name in world.slots]
 
@@ -115,20 +113,23 @@ def maximise_likelihood(
     iterations: int,
     follow: Follow,
 ) -> FollowedRuns:
-    """Return the runs, filtered with the likeliest parameters.
+    """Maximise the likelihood of the innovations by Gauss-Newton steps with step halving.
 
     Args:
-        followed: the runs, filtered with the parameters with which to begin.
+        followed: the runs, filtered with the initial parameters.
         places: of the parameters that are fitted.
         bounds: of these.
         iterations: maximum number of steps.
-        follow: filters the runs with other parameters; told the best filter so far.
+        follow: filters the runs with other parameters; its second argument is the best filter.
+
+    Returns:
+        The runs, filtered with the likeliest parameters.
     """
     best = followed
     for _ in range(iterations):
         if best.world.watch.left():
             break
-        step = _gauss_newton_step(best, places, bounds)
+        step, _ = gauss_newton_step(best, places, bounds)
         gained = 0.0
         for _ in range(1 + HALVINGS):
             tried = follow(best.theta + step, best)
@@ -142,29 +143,37 @@ def maximise_likelihood(
     return best
 
 
-def _is_within(bounds: Bounds, value: float) -> bool:
-    low, high = bounds
-    return low <= value <= high
+def gauss_newton_step(
+    followed: FollowedRuns, places: Sequence[int], bounds: Sequence[Bounds]
+) -> tuple[Array, float]:
+    """Compute the Gauss-Newton step of some parameters on the innovations.
 
+    Args:
+        followed: the runs, filtered with the present parameters.
+        places: of the parameters that change.
+        bounds: of these; the step ends there.
 
-def single_step(followed: FollowedRuns, place: int, bounds: Bounds) -> tuple[float, float]:
-    """Return the Gauss-Newton step of one parameter, and the log likelihood that it would gain if
-    the innovations were linear.
+    Returns:
+        The change of all parameters (P,), and the log likelihood that it would gain if the
+        innovations were linear.
     """
-    target = followed.filtered.whitened
-    column = _derivative(followed, target, place, bounds)
-    squares = float(np.square(column).sum())
-    if not squares > 0:
-        return 0.0, 0.0
-    low, high = bounds
-    value = float(followed.theta[place])
-    step = float(np.clip(value + (column * target).sum() / squares, low, high)) - value
-    gain = step * float((column * target).sum()) - 0.5 * step**2 * squares
-    return step, gain
+    own, target = list(places), followed.filtered.whitened
+    rows = np.stack(
+        [_derivative(followed, target, i, one) for i, one in zip(own, bounds, strict=True)], axis=-1
+    ).reshape(-1, len(own))
+    gram, cross = rows.T @ rows, rows.T @ target.reshape(-1)
+    scale = np.maximum(np.sqrt(np.diagonal(gram)), 1e-300)
+    normal = gram / scale / scale[:, None] + RIDGE * np.eye(len(own))
+    values = followed.theta[own]
+    low, high = np.array(bounds).T
+    change = np.clip(values + np.linalg.solve(normal, cross / scale) / scale, low, high) - values
+    step = np.zeros_like(followed.theta)
+    step[own] = change
+    return step, float(change @ cross - 0.5 * change @ gram @ change)
 
 
 def _derivative(followed: FollowedRuns, target: Array, place: int, bounds: Bounds) -> Array:
-    """By how much the whitened innovations fall (R, T, C) for each unit of a parameter."""
+    """The negative derivative (R, T, C) of the whitened innovations by a parameter."""
     low, high = bounds
     first, last = followed.world.parameters[place].bounds
     step = DIFFERENCE * min(last - first, high - low)
@@ -178,22 +187,6 @@ def _derivative(followed: FollowedRuns, target: Array, place: int, bounds: Bound
     return derivative
 
 
-def _gauss_newton_step(
-    followed: FollowedRuns, places: Sequence[int], bounds: Sequence[Bounds]
-) -> Array:
-    """The change of all parameters (P,) in a step of those at some places, within their bounds."""
-    theta = followed.theta
-    target = followed.filtered.whitened
-    columns = [
-        _derivative(followed, target, place, one) for place, one in zip(places, bounds, strict=True)
-    ]
-    rows = np.stack(columns, axis=-1).reshape(-1, len(places))
-    scale = np.maximum(np.sqrt(np.square(rows).sum(axis=0)), 1e-300)
-    rows = rows / scale
-    normal = rows.T @ rows + RIDGE * np.eye(len(places))
-    values = theta[list(places)]
-    wanted = values + np.linalg.solve(normal, rows.T @ target.reshape(-1)) / scale
-    low, high = np.array(bounds).T
-    result: Array = np.zeros_like(theta)
-    result[list(places)] = np.clip(wanted, low, high) - values
-    return result
+def _is_within(bounds: Bounds, value: float) -> bool:
+    low, high = bounds
+    return low <= value <= high

@@ -9,7 +9,7 @@ than noise. The order:
     2. Where a force is still missing, add effects one by one, each chosen by filters with the
        effect in the model.
     3. Select again, with effects of many shapes at the joints where a force is missing.
-    4. Simulate what gives between a drive and its links.
+    4. Simulate elasticity and play between a drive and its links.
     5. Try one effect in place of several.
 
 `fit_rivals` then fits the sets that do nearly as well: they may be equivalent.
@@ -27,6 +27,7 @@ import numpy as np
 from bench.gap.causes.candidates import Directions, Probe, first_probes
 from bench.gap.causes.gains import Group
 from bench.gap.causes.joint_hats import JointHat
+from bench.gap.causes.nominate import with_effect
 from bench.gap.causes.rules import ALPHA, SWITCH
 from bench.gap.causes.score_test import Scores
 from bench.gap.causes.search import Search
@@ -45,7 +46,7 @@ from bench.gap.model.problem import Fit, Known, Start
 from bench.gap.model.tangents import begun
 from bench.gap.prediction_error.candidate_responses import Columns, FollowedRuns
 from bench.gap.prediction_error.identification import Selected, identify, regress
-from bench.gap.prediction_error.likelihood_fit import maximise_likelihood, single_step
+from bench.gap.prediction_error.likelihood_fit import gauss_newton_step, maximise_likelihood
 from bench.gap.prediction_error.null_distribution import null_scores, p_value_of_gain
 from bench.gap.prediction_error.selection import Regression
 from sims.base import Array
@@ -54,7 +55,6 @@ from sims.robot.native import FIELDS
 from sims.robot.scales import scales
 from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
-from sims.simulated import Simulated
 from sims.system import Effect, members_of
 
 MANY_SHAPES = frozenset(
@@ -69,8 +69,6 @@ MANY_SHAPES = frozenset(
     }
 )
 """Effects that are tried at many shapes, and only where plain ones leave a force missing."""
-MIN_LOSS_WITHOUT_FORCE = 20.0
-"""Twice the log likelihood that must be lost without process noise for a force to be missing."""
 RIVAL_MARGIN = 20.0
 """Rivals this near in twice the log likelihood of the regression are fitted by simulation."""
 LINEARISATION_ERROR = 0.03
@@ -81,16 +79,24 @@ ALIKE_SHARE = 0.5
 """Share of an effect's gain by regression that another one at the same joint must have to be
 followed in its place.
 """
+JOINT_MODEL = ("friction.coulomb", "drag.linear", "inertia.armature")
+"""Effects at a joint that are tried at the joint where most is missing."""
+SERVO_MODEL = ("actuator.stiffness", "actuator.damping")
+"""Effects at a servo that are tried at the servo of this joint."""
+FIRST_SHARE = 0.1
+"""Initial coefficient as a share of the stated friction or of the typical force."""
 MAX_STEPS = 4
 """Maximum number of effects that are added one after another."""
-FIRST_SHARE = 0.1
-"""Share of the stated friction that is first taken away where less of it is tried."""
-JOINT_MODEL = ("friction.coulomb", "drag.linear", "inertia.armature")
-"""Effects at a joint that are always tried there."""
-SERVO_MODEL = ("actuator.stiffness", "actuator.damping")
-"""Effects at the servo of a joint that are always tried there."""
+MAX_TRIALS = 4
+"""Maximum number of effects by regression that are tried in the model at each step."""
 MAX_JOINT_TRIALS = 3
-"""Maximum number of them that are tried in the model at each step."""
+"""Maximum number of effects of the joint and servo models that are tried at each step."""
+MAX_IMPROVED_TRIALS = 3
+"""Maximum number of tried effects whose coefficients are improved at each step."""
+MAX_FIRST_EFFECTS = 2
+"""Maximum number of effects from which a set is grown."""
+ALL_SERVOS_STEPS = 6
+"""Maximum number of Gauss-Newton steps for the coefficients of all servos."""
 OFFSET_THRESHOLD = 10.0
 """A smoothed first position takes the place of the recorded one from so many times the noise."""
 RELINEARISATION_THRESHOLD = 100.0
@@ -99,14 +105,6 @@ MAX_SLOW_EFFECTS = 2
 """Sets of at most so many effects are fitted by simulation even where that is slow."""
 MAX_CACHED_FILTERS = 6
 """Number of filters that are kept for effects that were tried."""
-MAX_TRIALS = 4
-"""Maximum number of effects that are tried in the model at each step."""
-ALL_SERVOS_STEPS = 6
-"""Maximum number of Gauss-Newton steps for the numbers of all servos."""
-MAX_BEGINNINGS = 2
-"""Number of effects with which sets are begun."""
-BEST_TRIALS = 3
-"""Number of these whose coefficients are improved."""
 SOFT_FACTORS = (1.0, 2.0, 4.0)
 """Multiples of the stiff friction that are tried in the soft form, which is weaker at low speed."""
 NEARBY = (0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1)
@@ -123,19 +121,15 @@ EXPLAINED_EXCESS = 0.03
 """Excess over the noise below which a fitted set explains the data."""
 
 
-class _Tried(NamedTuple):
-    """An effect that was tried in the model: parameters (P,), the runs as a filter follows them,
-    its log likelihood, and the name of the effect.
-    """
-
-    theta: Array
-    followed: FollowedRuns
-    likelihood: float
-    name: str
-
-
 class SoftFrictionError(Exception):
     """Dry friction of these data has MuJoCo's soft form: search with a simulator of that form."""
+
+
+class _Trial(NamedTuple):
+    """A set of effects in the model: the runs as a filter with it follows them, and the names."""
+
+    followed: FollowedRuns
+    names: tuple[str, ...]
 
 
 @dataclass
@@ -162,10 +156,10 @@ class PredictionErrorSearch(Search):
         best = self._fit_dry_friction(selected)
         if not self._is_explained(best):
             best = self._of_higher_merit(best, self._fit_quick_selection(selected))
-        if not self._is_explained(best) and not self._must_end and self._base_lacks_force:
-            best = self._of_higher_merit(best, self._select_in_model(selected, ()))
-        if not self._is_explained(best) and not self._must_end and self._base_lacks_force:
-            self._refuse_softer_friction(best)
+        if not self._is_explained(best) and not self._must_end and self._lacks_force(self.follow()):
+            best = self._of_higher_merit(best, self._select_in_model((), self._reference))
+        if not self._is_explained(best) and not self._must_end and self._lacks_force(self.follow()):
+            self._check_soft_friction(best)
         if not self._is_explained(best):
             selected = self._select_with_shapes(selected)
             best = self._of_higher_merit(best, self._fit_quick_selection(selected))
@@ -182,13 +176,13 @@ class PredictionErrorSearch(Search):
 
         They have states of their own, so that each shape is simulated.
         """
-        joint = int(np.argmax(selected.followed.losses_without_force))
+        joint = selected.followed.joints_by_loss[0]
         effects = self.world.effects
         names = [n for n in self.world.library if is_series(effects[n])]
         probes = self._probes([n for n in names if self._acts_at(n, {joint})])
         if not probes:
             return self.base
-        self.world.watch.stage("testing what gives between drive and links", len(probes))
+        self.world.watch.stage("testing elasticity and play between drives and links", len(probes))
         starts = []
         for probe in probes:
             theta = self._reference.copy()
@@ -218,15 +212,14 @@ class PredictionErrorSearch(Search):
             or self._must_end
         ):
             return best
-        tried = self._try_one_more(self.follow(), self._reference, [])
+        tried = self._try_one_more(_Trial(self.follow(), ()))
         if not tried:
             return best
-        theta, followed, likelihood, name = tried[0]
         own = self._followed_by(best).log_likelihood
-        price = sum(self._penalty(one) for one in best.names) - self._penalty(name)
-        if 2.0 * (own - likelihood) > price + RIVAL_MARGIN:
+        penalty = sum(self._penalty(one) for one in best.names) - self._penalty(tried[0].names[-1])
+        if 2.0 * (own - tried[0].followed.log_likelihood) > penalty + RIVAL_MARGIN:
             return best
-        single = self._fit(Start((name,), theta, self._first_states(followed)))
+        single = self._fit_trial(tried[0])
         return self._of_higher_merit(self.fit_rivals(single), best)
 
     @staticmethod
@@ -242,13 +235,13 @@ class PredictionErrorSearch(Search):
         Raises:
             SoftFrictionError: the friction has MuJoCo's soft form.
         """
-        if not self._lacks_force(selected):
+        if not self._lacks_force(selected.followed):
             return self.base
         plain = self._plain_friction(selected)
         if not plain:
             return self.base
-        start = self._start(selected.groups, selected.coefficients)
-        only, own = self._reference.copy(), self._plain_theta(start)
+        only = self._reference.copy()
+        own = self._plain_theta(self._start(selected.groups, selected.coefficients))
         for name in plain:
             only[self.world.slots[name]] = own[self.world.slots[name]]
         best = self._fit(Start(plain, only, self._first_states(self.follow())))
@@ -259,34 +252,25 @@ class PredictionErrorSearch(Search):
             return best
         if softer and is_likelier_soft(self, best, SWITCH):
             raise SoftFrictionError
-        return self._of_higher_merit(best, self._select_in_model(selected, plain))
+        return self._of_higher_merit(best, self._select_in_model(plain, only))
 
-    @property
-    def _base_lacks_force(self) -> bool:
-        """Whether a force is missing in the base model."""
-        return bool((self.follow().losses_without_force > MIN_LOSS_WITHOUT_FORCE).any())
-
-    def _refuse_softer_friction(self, best: Model) -> None:
+    def _check_soft_friction(self, best: Model) -> None:
         """Follow the runs with dry friction in MuJoCo's soft form at the joint where most is
         missing.
 
         Raises:
             SoftFrictionError: that is likelier than the best model of stiff friction.
         """
-        world: Any = self.world
-        followed = self.follow()
-        coordinates = world.simulator.system.coordinates
-        joint = int(np.argmax(followed.losses_without_force[: len(coordinates)]))
-        name = f"friction.coulomb@{coordinates[joint].removeprefix('q.')}"
-        if world.kind.robot.friction_form == "soft" or name not in world.library:
+        world, followed = self.world, self.follow()
+        name = f"friction.coulomb@{self._joint_name(followed.joints_by_loss[0])}"
+        if self._is_soft or name not in world.library:
             return
-        (place,), (bounds,) = world.places(name), coefficient_bounds(world, name)
-        step, _ = single_step(followed, place, bounds)
+        step, _ = gauss_newton_step(followed, world.places(name), coefficient_bounds(world, name))
         own = self._followed_by(best).log_likelihood
-        for factor in SOFT_FACTORS if step > 0 else ():
-            theta = self._reference.copy()
-            theta[place] = np.clip(factor * step, *bounds)
-            if self._likelihood(theta, soft_kind(world.kind)) > own + 0.5 * SWITCH:
+        for factor in SOFT_FACTORS if step.max() > 0 else ():
+            start = self._reference.copy()
+            start[world.slots[name]] = self._within_bounds(name, factor * step[world.slots[name]])
+            if self._likelihood(start, self._soft_simulator) > own + 0.5 * SWITCH:
                 raise SoftFrictionError
 
     def _plain_friction(self, selected: Selected) -> tuple[str, ...]:
@@ -297,9 +281,10 @@ class PredictionErrorSearch(Search):
         names = [name for name in native if has_dry_friction(world, [name])]
         return tuple(n for n in names if not any(n in world.effects[m].contains for m in names))
 
-    def _lacks_force(self, selected: Selected) -> bool:
-        """Whether a force is missing in addition to the selection."""
-        return bool((selected.followed.losses_without_force > MIN_LOSS_WITHOUT_FORCE).any())
+    @staticmethod
+    def _lacks_force(followed: FollowedRuns) -> bool:
+        """Whether a force is missing in the model with which a filter follows the runs."""
+        return bool(followed.missing_forces.any())
 
     def _fit_quick_selection(self, selected: Selected) -> Model:
         """Fit the selected set by simulation.
@@ -307,16 +292,13 @@ class PredictionErrorSearch(Search):
         Return the base model where that is slow and a force is missing all the same.
         """
         large = len(selected.groups) > MAX_SLOW_EFFECTS
-        if large and self._is_slow(selected) and self._lacks_force(selected):
+        if large and self._is_slow(selected) and self._lacks_force(selected.followed):
             return self.base
         return self._fit_selection(selected)
 
     def _select_with_shapes(self, selected: Selected) -> Selected:
         """Select again with effects of many shapes, at the joints where a force is missing."""
-        joints = {
-            int(j)
-            for j in np.flatnonzero(selected.followed.losses_without_force > MIN_LOSS_WITHOUT_FORCE)
-        }
+        joints = set(np.flatnonzero(selected.followed.missing_forces).tolist())
         rich = [
             n for n in self.world.library if self._has_many_shapes(n) and self._acts_at(n, joints)
         ]
@@ -348,7 +330,7 @@ class PredictionErrorSearch(Search):
         states[:, : positions.shape[1]] = np.where(fine, positions, own)
         return states
 
-    def _select_in_model(self, selected: Selected, begin: Sequence[str]) -> Model:
+    def _select_in_model(self, names: Sequence[str], theta: Array) -> Model:
         """Add effects one after another, each chosen by whole filters with the effect in the model.
 
         Where much is missing, the noise of the measured motion is in the innovations and in the
@@ -356,108 +338,88 @@ class PredictionErrorSearch(Search):
         with the right effect in the model needs no process noise any more.
 
         Args:
-            selected: what regression has selected.
-            begin: dry friction that is in the model from the beginning.
+            names: dry friction that is in the model from the beginning.
+            theta: (P,) parameters of the model with it.
+
+        Raises:
+            SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
         """
-        theta, names = self._reference.copy(), list(begin)
-        followed = self.follow()
-        likelihood = followed.log_likelihood
-        if names:
-            own = self._plain_theta(self._start(selected.groups, selected.coefficients))
-            for name in names:
-                theta[self.world.slots[name]] = own[self.world.slots[name]]
-            theta, followed, likelihood = self._follow_with(theta, names)
-        first = self._try_one_more(followed, theta, names)
-        gains = [
-            one for one in first if 2.0 * (one.likelihood - likelihood) >= self._penalty(one.name)
-        ]
-        if not gains:
-            if not names:
-                return self.base
-            return self._judged_in_model(self._fit(self._start_of(followed, theta, names)))
-        fitted = self.base
-        for one in gains[:MAX_BEGINNINGS]:
-            # Two effects may do together what none does alone: the second best is also begun with.
-            fitted = self._of_higher_merit(fitted, self._grow(one, names))
-            if not self._is_explained(fitted) and not names:
+        begin = _Trial(self._follow_with(theta, names) if names else self.follow(), tuple(names))
+        first = self._larger_that_pay(begin)
+        if not first and not names:
+            return self.base
+        best = self.base if first else self._fit_trial(begin)
+        for trial in first[: 1 if names else MAX_FIRST_EFFECTS]:
+            # Two effects may explain together what neither explains alone.
+            best = self._of_higher_merit(best, self._fit_trial(self._grow(trial)))
+            if not self._is_explained(best) and not names:
                 # Filters of two effects may be as likely where their simulations are not.
-                alone = self._fit(self._start_of(one.followed, one.theta, [one.name]))
-                fitted = self._of_higher_merit(fitted, alone)
-            if self._is_explained(fitted) or names or self._must_end:
+                best = self._of_higher_merit(best, self._fit_trial(trial))
+            if self._is_explained(best) or self._must_end:
                 break
-        if not self._is_explained(fitted) and not names and not self._must_end:
-            fitted = self._of_higher_merit(fitted, self._fit_all_servos())
-        return self._judged_in_model(fitted)
+        if not self._is_explained(best) and not names and not self._must_end:
+            best = self._of_higher_merit(best, self._fit_all_servos())
+        if not np.isfinite(best.fit.cost) or not best.names:
+            return self.base
+        if not self._is_explained(best) and is_likelier_soft(self, best, SWITCH):
+            raise SoftFrictionError
+        return self._without_idle_effects(best)
 
     def _fit_all_servos(self) -> Model:
         """Fit stiffness and damping of all servos together, where forces are missing at several
-        joints: one of them without the other may gain less than what imitates both.
+        joints. Another effect may gain more than the stiffness or the damping alone.
         """
-        names = [f"{effect}@*" for effect in SERVO_MODEL]
-        lacking = self.follow().losses_without_force > MIN_LOSS_WITHOUT_FORCE
-        if lacking.sum() < 2 or any(name not in self.world.library for name in names):
+        names = tuple(f"{effect}@*" for effect in SERVO_MODEL)
+        several = self.follow().missing_forces.sum() > 1
+        if not several or any(name not in self.world.library for name in names):
             return self.base
-        theta, followed, _ = self._follow_with(self._reference, names, ALL_SERVOS_STEPS)
-        return self._fit(self._start_of(followed, theta, names))
+        followed = self._follow_with(self._reference, names, ALL_SERVOS_STEPS)
+        return self._fit_trial(_Trial(followed, names))
 
-    def _start_of(self, followed: FollowedRuns, theta: Array, names: Sequence[str]) -> Start:
-        """Where the fit of a set begins whose filter is known."""
-        return Start(tuple(names), theta, self._first_states(followed))
+    def _fit_trial(self, trial: _Trial) -> Model:
+        """Fit the effects of a trial by simulation."""
+        states = self._first_states(trial.followed)
+        return self._fit(Start(trial.names, trial.followed.theta, states))
 
-    def _judged_in_model(self, fitted: Model) -> Model:
-        """Return what is left of a fitted set without idle effects.
-
-        Raises:
-            SoftFrictionError: its dry friction is likelier in MuJoCo's soft form.
-        """
-        if not np.isfinite(fitted.fit.cost) or not fitted.names:
-            return self.base
-        if not self._is_explained(fitted) and is_likelier_soft(self, fitted, SWITCH):
-            raise SoftFrictionError
-        return self._without_idle_effects(fitted)
-
-    def _grow(self, first: _Tried, names: Sequence[str]) -> Model:
-        """Add effects to a first one while each pays, and fit the set by simulation."""
-        theta, followed, likelihood, name = first
-        names = [*self._beside(names, name), name]
+    def _grow(self, trial: _Trial) -> _Trial:
+        """Add effects to a trial while each pays."""
         for _ in range(MAX_STEPS - 1):
-            if not (followed.losses_without_force > MIN_LOSS_WITHOUT_FORCE).any():
+            larger = self._larger_that_pay(trial) if self._lacks_force(trial.followed) else []
+            if not larger:
                 break
-            tried = self._try_one_more(followed, theta, names)
-            if not tried or 2.0 * (tried[0].likelihood - likelihood) < self._penalty(tried[0].name):
-                break
-            theta, followed, likelihood, name = tried[0]
-            names = [*self._beside(names, name), name]
-        return self._fit(self._start_of(followed, theta, names))
+            trial = larger[0]
+        return trial
 
-    def _beside(self, names: Sequence[str], name: str) -> list[str]:
-        """The effects of a set that another effect does not contain."""
-        contained = self.world.effects[name].contains
-        return [n for n in names if n not in contained]
+    def _larger_that_pay(self, trial: _Trial) -> list[_Trial]:
+        """Trials with one more effect whose likelihood pays for it, the likeliest first."""
+        own = trial.followed.log_likelihood
+        return [
+            one
+            for one in self._try_one_more(trial)
+            if 2.0 * (one.followed.log_likelihood - own) >= self._penalty(one.names[-1])
+        ]
 
-    def _try_one_more(
-        self, followed: FollowedRuns, theta: Array, names: Sequence[str]
-    ) -> list[_Tried]:
-        """Follow the runs with each effect that gains most in addition to the model.
+    def _try_one_more(self, trial: _Trial) -> list[_Trial]:
+        """Follow the runs with each effect that gains most in addition to a trial.
 
-        Return the likeliest, the likelier first; none where no effect gains.
+        Return the likeliest, the likeliest first; none where no effect gains.
         """
-        watch, tried = self.world.watch, list[_Tried]()
+        watch, tried = self.world.watch, list[_Trial]()
         watch.stage("testing effects in the model one by one", MAX_TRIALS)
-        for name, start in self._propose_effects(followed, theta, names):
-            tried.append(_Tried(*self._follow_with(start, [*names, name], turns=0), name))
+        for start in self._propose_effects(trial):
+            tried.append(_Trial(self._follow_with(start.theta, start.effects, 0), start.effects))
             watch.advance()
             watch.check()
         # The coefficients of the best are improved before they are compared.
-        tried.sort(key=self._unlikeliness)
-        tried = [
-            _Tried(*self._follow_with(one.theta, [*names, one.name]), one.name)
-            for one in tried[:BEST_TRIALS]
+        improved = [
+            _Trial(self._follow_with(one.followed.theta, one.names), one.names)
+            for one in sorted(tried, key=self._criterion)[:MAX_IMPROVED_TRIALS]
         ]
-        return sorted(tried, key=self._unlikeliness)
+        return sorted(improved, key=self._criterion)
 
-    def _unlikeliness(self, tried: _Tried) -> float:
-        return self._penalty(tried.name) - 2.0 * tried.likelihood
+    def _criterion(self, trial: _Trial) -> float:
+        """Penalised log likelihood of a trial's last effect, as an information criterion."""
+        return self._penalty(trial.names[-1]) - 2.0 * trial.followed.log_likelihood
 
     def _without_idle_effects(self, model: Model) -> Model:
         """Remove effects that do not pay, and replace a family by a member that does as well."""
@@ -494,16 +456,10 @@ class PredictionErrorSearch(Search):
             return scores.p_value
         name = scores.effects[0]
         (group, coefficients), *_ = scores.peaks[0]
-        theta = model.fit.theta.copy()
-        contained = self.world.effects[name].contains
-        for other in contained:
-            # A free number is not among the effects.
-            if other in self.world.slots:
-                theta[self.world.slots[other]] = 0.0
-        theta[self.world.slots[name]] = self._numbers(group, coefficients)
-        names = (*(n for n in model.names if n not in contained), name)
-        self.refit([Start(names, theta, model.fit.states)], race=False)
-        larger = self.models[frozenset(names)]
+        numbers = self._numbers(group, coefficients)
+        start = with_effect(self.world, model.fit.start(), name, numbers)
+        self.refit([start], race=False)
+        larger = self.models[frozenset(start.effects)]
         gain = larger.likelihood.value - model.likelihood.value
         slot = self.world.slots[name]
         return p_value_of_gain(gain, slot.stop - slot.start, len(self.world.library))
@@ -513,12 +469,13 @@ class PredictionErrorSearch(Search):
         slot = self.world.slots[name]
         return float((slot.stop - slot.start) * self.price + 2.0 * np.log(len(self.world.library)))
 
-    def _propose_effects(
-        self, followed: FollowedRuns, theta: Array, names: Sequence[str]
-    ) -> list[tuple[str, Array]]:
-        """Return the effects that gain most in addition to the model, with first parameters."""
+    def _propose_effects(self, trial: _Trial) -> list[Start]:
+        """Return models with one more effect: those that gain most by regression, and those of the
+        standard joint model.
+        """
+        world, (followed, names) = self.world, trial
         columns = self._library_columns()
-        probes = [p for n in names for p in self._tangents(n, theta[self.world.slots[n]])]
+        probes = [p for n in names for p in self._tangents(n, followed.theta[world.slots[n]])]
         joined = columns.joined(followed.columns(probes)) if probes else columns
         always = range(len(columns.probes), len(joined.probes))
         regression = regress(followed, joined, always=always)
@@ -531,93 +488,76 @@ class PredictionErrorSearch(Search):
                 continue
             if len(found) == MAX_TRIALS or gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0):
                 break
-            start = theta.copy()
-            for contained in self.world.effects[group.effect].contains:
-                if contained in self.world.slots:
-                    start[self.world.slots[contained]] = 0.0
-            start[self.world.slots[group.effect]] = self._numbers(
-                group, regression.solve([group])[1][0]
-            )
-            found[group.effect] = start
-        return [
-            *found.items(),
-            *self._propose_joint_model(followed, theta, [*names, *found]),
-        ]
+            found[group.effect] = self._numbers(group, regression.solve([group])[1][0])
+        proposed = [*found.items(), *self._joint_model(followed, {*names, *found})]
+        own = Start(names, followed.theta, world.guess)
+        return [with_effect(world, own, name, c) for name, c in proposed]
 
-    def _propose_joint_model(
-        self,
-        followed: FollowedRuns,
-        theta: Array,
-        names: Sequence[str],
+    def _joint_model(
+        self, followed: FollowedRuns, known: Collection[str]
     ) -> list[tuple[str, Array]]:
         """Return effects of the standard joint model at the joint where most is missing, each with
-        a first coefficient: dry and viscous friction, armature, stiffness and damping of the servo,
-        and an offset of the encoder.
+        its first coefficient (1,): dry and viscous friction, armature, stiffness and damping of the
+        servo, and an offset of the encoder.
 
         A regression may miss them: they are not linear where a joint sticks, where a servo is stiff
         for a light joint, and where an offset changes the pose.
         """
         world = self.world
         assert isinstance(world.simulator, RobotSimulator)
-        coordinates = world.simulator.system.coordinates
-        joint = int(np.argmax(followed.losses_without_force[: len(coordinates)]))
-        place = coordinates[joint].removeprefix("q.")
-        found = []
-        offset, apart = f"sensor.bias@q.{place}", self._offset_from_command(joint)
-        if offset in world.library and offset not in names and apart:
-            start = theta.copy()
-            start[world.slots[offset]] = apart
-            found.append((offset, start))
-        servo = str(getattr(world.simulator.system, "servos", {}).get(joint, "")).removeprefix("u.")
-        model = [f"{effect}@{place}" for effect in JOINT_MODEL]
-        model += [f"{effect}@{servo}" for effect in SERVO_MODEL]
-        steps = []
-        for name in model:
-            if name in world.library and name not in names:
-                number = world.places(name)[0]
-                (bounds,) = coefficient_bounds(world, name)
-                step, gain = single_step(followed, number, bounds)
-                steps.append((gain, name, number, step))
-        steps.sort(key=lambda one: -one[0])
-        friction = f"friction.coulomb@{place}"
-        if friction in world.library and friction not in names:
-            ((low, _),) = coefficient_bounds(world, friction)
-            if low < 0:
-                # Less friction than stated: not what a derivative by more of it tells.
-                start = theta.copy()
-                start[world.places(friction)[0]] = FIRST_SHARE * low
-                found.append((friction, start))
+        joint = followed.joints_by_loss[0]
+        place = self._joint_name(joint)
         speed = max(float(np.abs(one.trajectory.v[:, joint]).max()) for one in followed.linear)
-        usual = {
+        typical = {
             f"drag.linear@{place}": FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9),
             f"inertia.armature@{place}": float(scales(world.simulator.robot).inertia[joint]),
         }
-        for gain, name, number, step in steps[:MAX_JOINT_TRIALS]:
-            # Where much process noise hides an effect, a typical size shows it.
-            first = step if gain > 0.5 * self._penalty(name) else usual.get(name, 0.0)
-            if first:
-                start = theta.copy()
-                start[number] += first
-                found.append((name, start))
-        return found
+        servo = str(getattr(world.simulator.system, "servos", {}).get(joint, "")).removeprefix("u.")
+        effects = [f"{effect}@{place}" for effect in JOINT_MODEL]
+        effects += [f"{effect}@{servo}" for effect in SERVO_MODEL]
+        steps = []
+        for name in effects:
+            if name in world.library and name not in known:
+                bounds = coefficient_bounds(world, name)
+                step, gain = gauss_newton_step(followed, world.places(name), bounds)
+                steps.append((gain, name, float(step[world.places(name)[0]])))
+        steps.sort(key=lambda one: -one[0])
+        first = {f"sensor.bias@q.{place}": self._offset_from_command(joint)}
+        friction = f"friction.coulomb@{place}"
+        if friction in world.library:
+            # A derivative by more friction does not tell what less friction than stated does.
+            first[friction] = FIRST_SHARE * min(coefficient_bounds(world, friction)[0][0], 0.0)
+        found = [(n, c) for n, c in first.items() if c and n in world.library and n not in known]
+        for gain, name, change in steps[:MAX_JOINT_TRIALS]:
+            # Where much process noise hides an effect, its typical size is tried.
+            pays = gain > 0.5 * self._penalty(name)
+            found.append((name, change if pays else typical.get(name, 0.0)))
+        return [(name, np.array([c])) for name, c in found if c]
+
+    def _joint_name(self, joint: int) -> str:
+        coordinate: str = self.world.simulator.system.coordinates[joint]
+        return coordinate.removeprefix("q.")
 
     def _follow_with(
-        self, theta: Array, names: Sequence[str], turns: int = GAUSS_NEWTON_STEPS
-    ) -> tuple[Array, FollowedRuns, float]:
-        """Follow the runs with effects in the model, and again after Gauss-Newton steps of their
-        coefficients on the innovations.
+        self, theta: Array, names: Sequence[str], steps: int = GAUSS_NEWTON_STEPS
+    ) -> FollowedRuns:
+        """Follow the runs with effects in the model, whose coefficients Gauss-Newton steps improve.
+
+        Args:
+            theta: (P,) initial parameters.
+            names: the effects.
+            steps: maximum number of Gauss-Newton steps.
         """
-        key = theta.tobytes()
-        known = self._trial_filters.get(key)
-        begin = self._follow_near(theta, self.follow()) if known is None else known
+        known = self._trial_filters.get(theta.tobytes())
+        begin = known or self._follow_near(theta, self.follow())
         bounds = [b for name in names for b in coefficient_bounds(self.world, name)]
         places = [place for name in names for place in self.world.places(name)]
-        best = maximise_likelihood(begin, places, bounds, turns, self._follow_near)
+        best = maximise_likelihood(begin, places, bounds, steps, self._follow_near)
         self._trial_filters = {
             best.theta.tobytes(): best,
             **dict(list(self._trial_filters.items())[:MAX_CACHED_FILTERS]),
         }
-        return best.theta, best, best.log_likelihood
+        return best
 
     def _follow_near(self, theta: Array, known: FollowedRuns) -> FollowedRuns:
         """Follow the runs with other parameters, the process noise being near one that is known."""
@@ -690,24 +630,34 @@ class PredictionErrorSearch(Search):
         The force of friction is not linear in its limit where a joint sticks or creeps, so whole
         models are followed.
         """
-        world = self.world
-        robot: Any = world.kind
         start = self._start(selected.groups, selected.coefficients)
         plain = self._plain_theta(start)
         has_state = not np.array_equal(plain, start.theta)
-        is_soft = robot.robot.friction_form == "soft"
-        likelihood = self._likelihood(plain, world.kind)
-        softer = -np.inf if is_soft else self._likelihood(plain, soft_kind(world.kind))
-        own = self._likelihood(start.theta, world.kind) if has_state else -np.inf
+        likelihood = self._likelihood(plain)
+        softer = -np.inf if self._is_soft else self._likelihood(plain, self._soft_simulator)
+        own = self._likelihood(start.theta) if has_state else -np.inf
         best = max(likelihood, softer)
         stands = best > own - 0.5 * SWITCH
         return stands, softer > max(likelihood, own) + 0.5 * SWITCH
 
-    def _likelihood(self, theta: Array, kind: type[Simulated]) -> float:
-        """Return the log likelihood of the innovations with a simulator and its parameters."""
-        world, followed = self.world, self.follow()
-        simulator = world.simulator if kind is world.kind else world.simulator_of(kind)
+    @property
+    def _is_soft(self) -> bool:
+        """Whether effects add dry friction in MuJoCo's soft form."""
+        robot: Any = self.world.kind
+        return bool(robot.robot.friction_form == "soft")
+
+    @cached_property
+    def _soft_simulator(self) -> RobotSimulator:
+        """The simulator with dry friction in MuJoCo's soft form."""
+        simulator = self.world.simulator_of(soft_kind(self.world.kind))
         assert isinstance(simulator, RobotSimulator)
+        return simulator
+
+    def _likelihood(self, theta: Array, simulator: RobotSimulator | None = None) -> float:
+        """Return the log likelihood of the innovations with these parameters of a simulator; None
+        stands for that of the world.
+        """
+        world, followed = self.world, self.follow()
         own = FollowedRuns.follow(world, theta, followed.noise, None, simulator, followed.force)
         return own.log_likelihood
 
@@ -800,7 +750,7 @@ class PredictionErrorSearch(Search):
         self.refit([found.fit.start()], race=False)
         found = self.models[frozenset(start.effects)]
         if not self._is_explained(found):
-            # Those about a motion that is wrong hold for no other model.
+            # Derivatives about a wrong motion hold for no other model.
             self.world.derivatives = before
         for name in found.names:
             if has_dry_friction(self.world, [name]) and not self._is_explained(found):
@@ -842,26 +792,31 @@ class PredictionErrorSearch(Search):
                 theta[self.world.slots[group.effect]] = self._numbers(group, coefficients)
                 if behind > RIVAL_MARGIN:
                     # Regression is linear; a filter with the rival in the model is not.
-                    theta, _, likelihood = self._follow_with(theta, names)
-                    if 2.0 * (own - likelihood) > RIVAL_MARGIN:
+                    followed = self._follow_with(theta, names)
+                    if 2.0 * (own - followed.log_likelihood) > RIVAL_MARGIN:
                         continue
+                    theta = followed.theta
                 starts.append(Start(names, theta, best.fit.states))
         if starts:
             self.refit(starts, race=False)
-        self._refine_near(best)
         size = len(best.names)
-        fitted = [m for m in self.models.values() if len(m.names) == size]
-        return max(fitted, key=lambda model: model.merit)
+        self._refine_near(size)
+        likeliest = self.best(size)
+        return best if likeliest is None else likeliest
 
-    def _refine_near(self, best: Model) -> None:
-        """Fit the models that do nearly as well as the best one until nothing is left to gain, so
-        that what a fit has not reached does not decide between them.
+    def _refine_near(self, size: int) -> None:
+        """Fit the models with so many effects that do nearly as well as the best until nothing is
+        left to gain, so that incomplete fits do not decide between them.
         """
-        size = len(best.names)
-        fitted = [m for m in self.models.values() if len(m.names) == size]
-        highest = max(m.merit for m in fitted)
-        near = [m for m in fitted if m.merit > highest - RIVAL_MARGIN]
-        if len(near) < 2 or self._must_end:
+        likeliest = self.best(size)
+        if likeliest is None or self._must_end:
+            return
+        near = [
+            model
+            for model in self.models.values()
+            if len(model.names) == size and model.merit > likeliest.merit - RIVAL_MARGIN
+        ]
+        if len(near) < 2:
             return
         fitter = Fitter(self.world, self.noise, self.frozen, exact=True)
         for model, fit in zip(near, fitter.fit([m.fit.start() for m in near], STEPS), strict=True):
@@ -879,24 +834,26 @@ class PredictionErrorSearch(Search):
         gains = rest.gains([]) - np.array([rest.price(group) for group in rest.groups])
         mine = rest.gain_of(own) - self._penalty(name)
         found: dict[str, tuple[Group, Array, float]] = {}
-        alike = self._joint_model_beside(name)
-        usual = 0
+        same_joint = self._joint_models_where_acts(name)
+        near_count = 0
         for i in np.argsort(-gains, kind="stable").tolist():
             group = rest.groups[i]
             behind = mine - float(gains[i])
-            is_near = behind <= RIVAL_MARGIN + LINEARISATION_ERROR * mine and usual < MAX_RIVALS
-            # Of a large effect regression tells little: what acts at the same joint is tried.
-            is_alike = group.effect in alike and gains[i] > ALIKE_SHARE * mine
+            is_near = (
+                behind <= RIVAL_MARGIN + LINEARISATION_ERROR * mine and near_count < MAX_RIVALS
+            )
+            # Regression is inaccurate for a large effect, so effects at the same joint are tried.
+            is_alike = group.effect in same_joint and gains[i] > ALIKE_SHARE * mine
             if group.effect not in self.world.library or group.effect in (*model.names, *found):
                 continue
             # A law that contains this one never replaces it.
             if (is_near or is_alike) and name not in self.world.effects[group.effect].contains:
-                usual += is_near
+                near_count += is_near
                 found[group.effect] = group, rest.solve([group])[1][0], behind
         return list(found.values())
 
-    def _joint_model_beside(self, name: str) -> set[str]:
-        """The effects of the standard joint model at the joint where an effect acts."""
+    def _joint_models_where_acts(self, name: str) -> set[str]:
+        """The effects of the joint and servo models at the joint where an effect acts."""
         count = len(self.world.simulator.system.coordinates)
         joints = {j for j in range(count) if self._acts_at(name, {j})}
         plain = (*JOINT_MODEL, *SERVO_MODEL)
@@ -924,9 +881,13 @@ class PredictionErrorSearch(Search):
             # A fixed change is that of this very size.
             if not probes[column].fixed:
                 c[probes[column].place] = value
-        low, high = np.array(coefficient_bounds(self.world, group.effect)).T
-        found: Array = np.clip(c, low, high)
-        return found
+        return self._within_bounds(group.effect, c)
+
+    def _within_bounds(self, name: str, c: Array) -> Array:
+        """The coefficients (k,) of an effect, limited to their bounds."""
+        low, high = np.array(coefficient_bounds(self.world, name)).T
+        limited: Array = np.clip(c, low, high)
+        return limited
 
     # -- scores
 
