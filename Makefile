@@ -3,6 +3,7 @@
 # make robot     the same for a robot: an arm's model file and a log, with friction in the elbow
 # make test      the tests that take a few seconds each (about 6 minutes on two cores)
 # make test-all  these and the slow ones: exams, comparisons, clusters, kills (about 15 minutes)
+# make test-rest the slow ones and those that depend on recordings beside the clone
 # make check     lint, types and import rules
 # make docs      the site, to be read without a network: site/html/index.html (Python 3.11 or newer)
 # make exam      hides causes in hundreds of recordings and has explain find them (about 6 minutes; QUICK=--quick)
@@ -19,7 +20,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: compare explain robot test test-all check exam benchmark chaos malformed mutants reference multi wheel docs install
+.PHONY: compare explain robot test test-all test-rest check exam benchmark chaos malformed mutants reference multi wheel docs install
 # Another WITHOUT than that of the last install changes the environment; other targets take it as it is.
 install:
 	@if [ -f $(STAMP) ] && [ "$$(cat $(STAMP))" != "$(strip $(LEFT_OUT))" ]; then rm $(STAMP); fi
@@ -42,6 +43,7 @@ else
 	$(PIP) install --constraint requirements.lock -r requirements-explain.txt hatchling editables $(filter-out $(LEFT_OUT),$(LARGE))
 	$(PIP) install --no-deps --no-build-isolation --editable .
 endif
+	$(BIN)/python -m bench.gap.prediction_error.precompile
 	@echo "$(strip $(LEFT_OUT))" > $@
 
 TARGETS ?= 10
@@ -69,6 +71,9 @@ test: $(STAMP)
 
 test-all: $(STAMP)
 	$(PYTEST)
+
+test-rest: $(STAMP)
+	$(PYTEST) -m "slow or data"
 
 check: $(STAMP)
 	$(BIN)/ruff check .

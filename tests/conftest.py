@@ -1,4 +1,5 @@
 import os
+import re
 import signal
 from collections import Counter
 from pathlib import Path
@@ -10,6 +11,11 @@ PLUGINS = Path(__file__).parent / "plugins"
 _SHARED = Path(__file__).parents[2] / "shared"
 _BESIDE = _SHARED / "data"
 """Folder of the real recordings on machines that have them."""
+
+_READS_DATA = re.compile(
+    "SIMGAP_(DATA|ROBOTS)|[\"']shared[\"']|pendulum-real|robot-so101|simgap list"
+)
+"""What a test file contains whose tests may differ with these recordings."""
 
 # For child processes too. Values that the user has set stand.
 for _name, _folder in (("SIMGAP_DATA", _BESIDE), ("SIMGAP_ROBOTS", _SHARED / "robots")):
@@ -95,10 +101,16 @@ _SECONDS = {True: 15.0, False: 0.2}
 """What a test takes, about, by whether it is marked as slow."""
 
 
+@pytest.hookimpl(tryfirst=True)  # before `-m` chooses by markers
 def pytest_collection_modifyitems(items):
-    """Files that take long come first: one that began last would keep the other workers waiting."""
+    """Mark the tests that depend on the folder of recordings beside the clone, and put files that
+    take long first: one that began last would keep the other workers waiting.
+    """
     seconds = Counter()
+    reads = {path: bool(_READS_DATA.search(path.read_text())) for path in {i.path for i in items}}
     for item in items:
+        if reads[item.path] or "recordings" in item.fixturenames:
+            item.add_marker(pytest.mark.data)
         seconds[item.path] += _SECONDS[item.get_closest_marker("slow") is not None]
     items.sort(key=lambda item: -seconds[item.path])
 

@@ -1,0 +1,32 @@
+"""Compile the recursions of the filter and the smoother, so that the first command need not.
+
+`make install` runs `python -m bench.gap.prediction_error.precompile`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.gap.prediction_error.state_estimation import LinearRuns, filter_runs, smooth_runs
+
+
+def precompile() -> None:
+    """Filter and smooth one run of two samples, for which numba compiles and keeps the code."""
+    states, forces = np.ones((1, 1, 2, 2)), np.ones((1, 1, 2, 1))
+    runs = LinearRuns(
+        states=states,
+        defects=np.zeros((1, 1, 2)),
+        forces=forces,
+        inputs=forces,
+        readings=np.ones((1, 2, 1, 2)),
+        residuals=np.zeros((1, 2, 1)),
+        recorded=np.ones((1, 2, 1), dtype=bool),
+        prior=np.ones(2),
+        step_errors=np.zeros((1, 1, 2)),
+    )
+    force, white = np.ones(1), np.ones(1)
+    smooth_runs(runs, filter_runs(runs, force, white), force)
+
+
+if __name__ == "__main__":
+    precompile()
