@@ -14,6 +14,7 @@ import numpy as np
 from sims.base import Array
 from sims.robot.acting import is_asked, natives
 from sims.robot.floating import Afloat
+from sims.robot.force_limits import LIMIT_FIELDS, ForceLimits
 from sims.robot.forces import LOADED, exerted, is_in_drive, moment_of
 from sims.robot.lanes import Addresses, Bench
 from sims.robot.midway import Places
@@ -175,6 +176,20 @@ class Instants:
             accelerations.append(self._bench.batch.bind("qacc")[:n, dofs].copy())
             readings.append(self._readings(n))
         return np.concatenate(accelerations), np.concatenate(readings)
+
+    def at_limits(self, limits: ForceLimits) -> Array:
+        """Return (N, K) whether a servo may have reached each force limit, at each instant."""
+        for name in LIMIT_FIELDS:
+            self._bench.batch.bind(name)
+        found = []
+        for n, ids in self._placed({}, self.acting):
+            self._bench.batch.forward(ids)
+            bind = self._bench.batch.bind
+            pairs = zip(limits.fields, limits.columns, strict=True)
+            forces = np.stack([bind(name)[:n, column] for name, column in pairs], axis=1)
+            found.append(np.abs(forces) >= limits.sizes)
+        result: Array = np.concatenate(found)
+        return result
 
     def _readings(self, n: int) -> Array:
         """(n, O) of the lanes, as they are now."""

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from sims.base import Array, Scenario
 from sims.robot.floating import Afloat
+from sims.robot.force_limits import stiff_force_limits
 from sims.robot.forces import LOADED
 from sims.robot.instants import HELD, SIDES, Instants, Motion
 from sims.robot.linear import Added, Linear
@@ -78,6 +79,7 @@ class IntervalMaps:
         readings: H (T, C, Z).
         predicted: h(x̄) (T, C).
         step_errors: (T - 1, Z) what the steps of the integrator miss.
+        jumps: (T - 1, Z) standard deviations of what force limits of servos do to the state.
     """
 
     states: Array
@@ -87,6 +89,7 @@ class IntervalMaps:
     readings: Array
     predicted: Array
     step_errors: Array
+    jumps: Array
 
 
 class MeasuredLinear(Linear):
@@ -229,7 +232,27 @@ class MeasuredLinear(Linear):
         with np.errstate(all="ignore"), quiet():
             seen = self._seen(moved, read, [()] * size)
         readings = np.moveaxis((seen - self.observed) / SMALL, 0, 2)
-        return IntervalMaps(states, defect, force, self._composed, readings, self.observed, missed)
+        return IntervalMaps(
+            states, defect, force, self._composed, readings, self.observed, missed, self._jumps()
+        )
+
+    def _jumps(self) -> Array:
+        """(T - 1, Z) standard deviations of the jumps at force limits of stiff servos."""
+        bench = self._simulator.wide(self._work.acting)
+        limits = stiff_force_limits(bench.model)
+        result = np.zeros((self.knots.size - 1, self._tangent.size))
+        if not limits.dofs.size:
+            return result
+        with np.errstate(all="ignore"), quiet():
+            reached = self._tangent.at_limits(limits)
+        own = limits.jumps[:, bench.places.velocities]
+        for steps, active in self._within():
+            result[active, : own.shape[1]] += reached[steps] @ own
+        # A position servo comes back from a jump of position within the interval or later.
+        lengths = np.maximum(np.diff(self.knots), 1)[:, None] * self._simulator.step
+        moved = self.positions
+        result[:, moved : 2 * moved] = result[:, :moved] / lengths
+        return result
 
     def _step_errors(self) -> Array:
         """(N, Z) what a step misses; nothing for Runge-Kutta, which is of fourth order."""

@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.base import Array
+from sims.robot.force_limits import ForceLimits
 from sims.robot.forces import is_in_drive
 from sims.robot.instants import Instants
 from sims.robot.lanes import Bench
@@ -312,6 +313,11 @@ class Tangent:
             result[:, -2 * moves : -moves] = -base[:, -2 * moves : -moves]
             result[:, -moves:] = motion.afloat.rate[1:] - base[:, -moves:]
         return result
+
+    def at_limits(self, limits: ForceLimits) -> Array:
+        """Return (S, K) whether a servo may have reached each force limit, in each step."""
+        with self._at.every_step():
+            return self._at.at_limits(limits)
 
     def _between(self, values: Array) -> Array:
         """(S, k) of values (N, k) at the instants that are looked at, linear from one to the next

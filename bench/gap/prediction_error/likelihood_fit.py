@@ -129,7 +129,9 @@ def maximise_likelihood(
     for _ in range(iterations):
         if best.world.watch.left():
             break
-        step, _ = gauss_newton_step(best, places, bounds)
+        step, expected = gauss_newton_step(best, places, bounds)
+        if expected < LEAST_GAIN:
+            break
         gained = 0.0
         for _ in range(1 + HALVINGS):
             tried = follow(best.theta + step, best)

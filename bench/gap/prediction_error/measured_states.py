@@ -102,6 +102,7 @@ def _tracked(times: Array, readings: list[tuple[Array, Array]]) -> list[Array]:
         np.repeat(recorded, levels, axis=0),
         prior,
         np.zeros((count * levels, samples - 1, 3)),
+        np.zeros((count * levels, samples - 1, 3)),
     )
     force = (sizes[:, None] * JERKS / span**3).reshape(-1, 1)
     filtered = filter_runs(runs, force, np.ones(2))

@@ -67,6 +67,7 @@ def _filter(
     forces: Array,
     readings: Array,
     residuals: Array,
+    jumps: Array,
     variances: Array,
     prior: Array,
     deviations: Array,
@@ -86,6 +87,7 @@ def _filter(
         forces: G (B, T - 1, Z, E).
         readings: H (B, T, C, Z).
         residuals: r (B, T, C).
+        jumps: J (B, T - 1, Z), variances.
         variances: of white noise (B, T, C).
         prior: (Z,) standard deviations of the first states.
         deviations: (B, E) standard deviations of the missing forces.
@@ -186,7 +188,7 @@ def _filter(
             lost = False
             for z in range(size):
                 for y in range(z + 1):
-                    value = spread[z, y]
+                    value = spread[z, y] + (jumps[run, i, z] if z == y else 0.0)
                     for e in range(count):
                         g = forces[run, i, z, e]
                         if g != 0.0:

@@ -4,13 +4,15 @@
 whole simulated runs (output errors), which decide. The search ends as soon as a set leaves no more
 than noise. The order:
 
-    1. Select effects with few shapes by regression, and fit the set; dry friction first, in either
-       of its forms, since it is not linear where a joint sticks.
-    2. Where a force is still missing, add effects one by one, each chosen by filters with the
-       effect in the model.
-    3. Select again, with effects of many shapes at the joints where a force is missing.
-    4. Simulate elasticity and play between a drive and its links.
-    5. Try one effect in place of several.
+    1. Select effects with few shapes by regression. Fit the dry friction among them alone, since it
+       is not linear where a joint sticks, and then the set.
+    2. Where a force is still missing, fit each of the effects alone that gain most, and those of
+       the standard joint model.
+    3. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
+       filters with the effect in the model.
+    4. Select again, with effects of many shapes at the joints where a force is missing.
+    5. Simulate elasticity and play between a drive and its links.
+    6. Try one effect in place of several.
 
 `fit_rivals` then fits the sets that do nearly as well: they may be equivalent.
 """
@@ -93,6 +95,8 @@ MAX_JOINT_TRIALS = 3
 """Maximum number of effects of the joint and servo models that are tried at each step."""
 MAX_IMPROVED_TRIALS = 3
 """Maximum number of tried effects whose coefficients are improved at each step."""
+SETTLED_SHARE = 0.1
+"""Share of a gain by which another trial must be behind not to be improved."""
 MAX_FIRST_EFFECTS = 2
 """Maximum number of effects from which a set is grown."""
 ALL_SERVOS_STEPS = 6
@@ -115,8 +119,12 @@ MIN_GAIN_SHARE = 0.3
 """Share of the largest gain by regression that an effect must have to be tried in the model."""
 GAUSS_NEWTON_STEPS = 2
 """Maximum number of Gauss-Newton steps for an effect that is tried in the model."""
+MAX_IMPROVED_SIZE = 3
+"""Maximum number of coefficients of a rival whose coefficients are improved."""
 RELATIVE_DIFFERENCE = 0.02
 """Share of a coefficient by which it is moved for its derivative."""
+TRIED_SHARES = (1.0, 0.5)
+"""Shares of the coefficients by regression with which a filter must follow the runs better."""
 EXPLAINED_EXCESS = 0.03
 """Excess over the noise below which a fitted set explains the data."""
 
@@ -153,13 +161,16 @@ class PredictionErrorSearch(Search):
         watch.stage("selecting effects", 1)
         selected = identify(followed, columns)
         self._selected = selected
-        best = self._fit_dry_friction(selected)
+        friction = self._fit_dry_friction(selected)
+        best = friction
         if not self._is_explained(best):
             best = self._of_higher_merit(best, self._fit_quick_selection(selected))
         if not self._is_explained(best) and not self._must_end and self._lacks_force(self.follow()):
-            best = self._of_higher_merit(best, self._select_in_model((), self._reference))
+            best = self._of_higher_merit(best, self._fit_single_effects())
+        if not self._is_explained(best) and not self._must_end:
+            best = self._of_higher_merit(best, self._add_to_dry_friction(selected, friction))
         if not self._is_explained(best) and not self._must_end and self._lacks_force(self.follow()):
-            self._check_soft_friction(best)
+            best = self._of_higher_merit(best, self._select_in_model((), self._reference))
         if not self._is_explained(best):
             selected = self._select_with_shapes(selected)
             best = self._of_higher_merit(best, self._fit_quick_selection(selected))
@@ -227,50 +238,61 @@ class PredictionErrorSearch(Search):
         return max(one, other, key=lambda model: model.merit)
 
     def _fit_dry_friction(self, selected: Selected) -> Model:
-        """Fit the dry friction of a selection, and add effects to it.
+        """Fit the dry friction of a selection alone.
 
         Return the base model where no force is missing in addition to the selection, or where it
         has no friction.
+        """
+        plain = self._plain_friction(selected)
+        if not plain or not self._lacks_force(selected.followed):
+            return self.base
+        theta = self._friction_of(selected, plain)
+        best = self._fit(Start(plain, theta, self._first_states(self.follow())))
+        return self._without_idle_effects(best) if self._is_explained(best) else best
+
+    def _friction_of(self, selected: Selected, plain: Sequence[str]) -> Array:
+        """The parameters (P,) with the dry friction of a selection, and nothing else of it."""
+        theta = self._reference.copy()
+        own = self._plain_theta(self._start(selected.groups, selected.coefficients))
+        for name in plain:
+            theta[self.world.slots[name]] = own[self.world.slots[name]]
+        return theta
+
+    def _add_to_dry_friction(self, selected: Selected, friction: Model) -> Model:
+        """Add effects to the dry friction of a selection, which was fitted alone.
+
+        Return the base model where it has none, or where other friction does better.
 
         Raises:
             SoftFrictionError: the friction has MuJoCo's soft form.
         """
-        if not self._lacks_force(selected.followed):
+        if not friction.names:
             return self.base
-        plain = self._plain_friction(selected)
-        if not plain:
-            return self.base
-        only = self._reference.copy()
-        own = self._plain_theta(self._start(selected.groups, selected.coefficients))
-        for name in plain:
-            only[self.world.slots[name]] = own[self.world.slots[name]]
-        best = self._fit(Start(plain, only, self._first_states(self.follow())))
-        if self._is_explained(best):
-            return self._without_idle_effects(best)
         stands, softer = self._form_of_friction(selected)
         if not stands:
-            return best
-        if softer and is_likelier_soft(self, best, SWITCH):
+            return self.base
+        if softer and is_likelier_soft(self, friction, SWITCH):
             raise SoftFrictionError
-        return self._of_higher_merit(best, self._select_in_model(plain, only))
+        plain = self._plain_friction(selected)
+        return self._select_in_model(plain, self._friction_of(selected, plain))
 
-    def _check_soft_friction(self, best: Model) -> None:
+    def _check_soft_friction(self, best: _Trial) -> None:
         """Follow the runs with dry friction in MuJoCo's soft form at the joint where most is
         missing.
 
         Raises:
-            SoftFrictionError: that is likelier than the best model of stiff friction.
+            SoftFrictionError: that is likelier than the best trial.
         """
         world, followed = self.world, self.follow()
         name = f"friction.coulomb@{self._joint_name(followed.joints_by_loss[0])}"
         if self._is_soft or name not in world.library:
             return
         step, _ = gauss_newton_step(followed, world.places(name), coefficient_bounds(world, name))
-        own = self._followed_by(best).log_likelihood
         for factor in SOFT_FACTORS if step.max() > 0 else ():
             start = self._reference.copy()
             start[world.slots[name]] = self._within_bounds(name, factor * step[world.slots[name]])
-            if self._likelihood(start, self._soft_simulator) > own + 0.5 * SWITCH:
+            likelihood = self._likelihood(start, self._soft_simulator)
+            if likelihood > best.followed.log_likelihood + 0.5 * SWITCH:
                 raise SoftFrictionError
 
     def _plain_friction(self, selected: Selected) -> tuple[str, ...]:
@@ -294,7 +316,17 @@ class PredictionErrorSearch(Search):
         large = len(selected.groups) > MAX_SLOW_EFFECTS
         if large and self._is_slow(selected) and self._lacks_force(selected.followed):
             return self.base
+        if not selected.groups or not self._pays(selected):
+            return self.base
         return self._fit_selection(selected)
+
+    def _pays(self, selected: Selected) -> bool:
+        """Whether a filter with the selected set in the model is so much likelier than without it
+        that the set pays. Far from the base model, the regression is wrong.
+        """
+        theta = self._start(selected.groups, selected.coefficients).theta
+        gain = self._likelihood(theta) - self.follow().log_likelihood
+        return 2.0 * gain > sum(self._penalty(name) for name in selected.effects)
 
     def _select_with_shapes(self, selected: Selected) -> Selected:
         """Select again with effects of many shapes, at the joints where a force is missing."""
@@ -347,16 +379,20 @@ class PredictionErrorSearch(Search):
         begin = _Trial(self._follow_with(theta, names) if names else self.follow(), tuple(names))
         first = self._larger_that_pay(begin)
         if not first and not names:
+            self._check_soft_friction(begin)
             return self.base
-        best = self.base if first else self._fit_trial(begin)
+        best = self._fit_trial(begin) if names and not first else self.base
+        for trial in self._nearly_as_likely(first):
+            best = self._of_higher_merit(best, self._fit_trial(trial))
+            if self._must_end:
+                break
+        if not self._is_explained(best) and not names and not self._must_end:
+            self._check_soft_friction(first[0])
+        # Two effects may explain together what neither explains alone.
         for trial in first[: 1 if names else MAX_FIRST_EFFECTS]:
-            # Two effects may explain together what neither explains alone.
-            best = self._of_higher_merit(best, self._fit_trial(self._grow(trial)))
-            if not self._is_explained(best) and not names:
-                # Filters of two effects may be as likely where their simulations are not.
-                best = self._of_higher_merit(best, self._fit_trial(trial))
             if self._is_explained(best) or self._must_end:
                 break
+            best = self._of_higher_merit(best, self._fit_trial(self._grow(trial)))
         if not self._is_explained(best) and not names and not self._must_end:
             best = self._of_higher_merit(best, self._fit_all_servos())
         if not np.isfinite(best.fit.cost) or not best.names:
@@ -364,6 +400,40 @@ class PredictionErrorSearch(Search):
         if not self._is_explained(best) and is_likelier_soft(self, best, SWITCH):
             raise SoftFrictionError
         return self._without_idle_effects(best)
+
+    def _fit_single_effects(self) -> Model:
+        """Fit each of the proposed effects alone by simulation, side by side.
+
+        Return the base model where none explains the runs. A filter is linear about the measured
+        motion, which a joint that sticks and a servo at its limit are not.
+
+        Raises:
+            SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
+        """
+        states = self._first_states(self.follow())
+        starts = self._propose_effects(_Trial(self.follow(), ()), len(JOINT_MODEL + SERVO_MODEL))
+        self.refit([replace(start, states=states) for start in starts])
+        found = [
+            self.models[frozenset(s.effects)] for s in starts if frozenset(s.effects) in self.models
+        ]
+        best = max(found, key=lambda model: model.merit, default=self.base)
+        if best.names and np.isfinite(best.fit.cost):
+            best = self._fit(best.fit.start())
+        if self._is_explained(best):
+            return best
+        self._check_soft_friction(_Trial(self._followed_by(best), best.names))
+        return self.base
+
+    def _nearly_as_likely(self, tried: Sequence[_Trial]) -> Sequence[_Trial]:
+        """The trials that simulation has to decide between, the likeliest first: a filter's model
+        is linear, which a joint that sticks and a servo at its limit are not.
+        """
+        if not tried:
+            return ()
+        gain = 2.0 * (tried[0].followed.log_likelihood - self.follow().log_likelihood)
+        limit = self._criterion(tried[0]) + RIVAL_MARGIN + LINEARISATION_ERROR * gain
+        near = [trial for trial in tried if self._criterion(trial) <= limit]
+        return [*near, *tried[len(near) : MAX_FIRST_EFFECTS]]
 
     def _fit_all_servos(self) -> Model:
         """Fit stiffness and damping of all servos together, where forces are missing at several
@@ -411,11 +481,21 @@ class PredictionErrorSearch(Search):
             watch.advance()
             watch.check()
         # The coefficients of the best are improved before they are compared.
-        improved = [
-            _Trial(self._follow_with(one.followed.theta, one.names), one.names)
-            for one in sorted(tried, key=self._criterion)[:MAX_IMPROVED_TRIALS]
-        ]
-        return sorted(improved, key=self._criterion)
+        found = list[_Trial]()
+        for one in sorted(tried, key=self._criterion)[:MAX_IMPROVED_TRIALS]:
+            if found and self._is_settled(found[0], one):
+                found.append(one)
+                continue
+            found.append(_Trial(self._follow_with(one.followed.theta, one.names), one.names))
+            found.sort(key=self._criterion)
+        return found
+
+    def _is_settled(self, best: _Trial, other: _Trial) -> bool:
+        """Whether a trial explains the runs, and another one is far behind."""
+        gain = 2.0 * (best.followed.log_likelihood - self.follow().log_likelihood)
+        behind = self._criterion(other) - self._criterion(best)
+        far = behind > RIVAL_MARGIN + SETTLED_SHARE * gain
+        return far and not self._lacks_force(best.followed)
 
     def _criterion(self, trial: _Trial) -> float:
         """Penalised log likelihood of a trial's last effect, as an information criterion."""
@@ -458,20 +538,30 @@ class PredictionErrorSearch(Search):
         (group, coefficients), *_ = scores.peaks[0]
         numbers = self._numbers(group, coefficients)
         start = with_effect(self.world, model.fit.start(), name, numbers)
+        slot = self.world.slots[name]
+        size, count = slot.stop - slot.start, len(self.world.library)
+        # A filter with the effect in the model is faster than a fit, and not linear in it.
+        own = self._followed_by(model).log_likelihood
+        gains = []
+        for share in TRIED_SHARES:
+            theta = start.theta.copy()
+            theta[slot] *= share
+            gains.append(2.0 * (self._likelihood(theta) - own))
+        by_filter = p_value_of_gain(max(gains), size, count)
+        if by_filter > ALPHA:
+            return by_filter
         self.refit([start], race=False)
         larger = self.models[frozenset(start.effects)]
-        gain = larger.likelihood.value - model.likelihood.value
-        slot = self.world.slots[name]
-        return p_value_of_gain(gain, slot.stop - slot.start, len(self.world.library))
+        return p_value_of_gain(larger.likelihood.value - model.likelihood.value, size, count)
 
     def _penalty(self, name: str) -> float:
         """Return what an effect must gain in twice the log likelihood."""
         slot = self.world.slots[name]
         return float((slot.stop - slot.start) * self.price + 2.0 * np.log(len(self.world.library)))
 
-    def _propose_effects(self, trial: _Trial) -> list[Start]:
-        """Return models with one more effect: those that gain most by regression, and those of the
-        standard joint model.
+    def _propose_effects(self, trial: _Trial, most: int = MAX_JOINT_TRIALS) -> list[Start]:
+        """Return models with one more effect: those that gain most by regression, and at most so
+        many of the standard joint model.
         """
         world, (followed, names) = self.world, trial
         columns = self._library_columns()
@@ -489,12 +579,12 @@ class PredictionErrorSearch(Search):
             if len(found) == MAX_TRIALS or gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0):
                 break
             found[group.effect] = self._numbers(group, regression.solve([group])[1][0])
-        proposed = [*found.items(), *self._joint_model(followed, {*names, *found})]
+        proposed = [*found.items(), *self._joint_model(followed, {*names, *found}, most)]
         own = Start(names, followed.theta, world.guess)
         return [with_effect(world, own, name, c) for name, c in proposed]
 
     def _joint_model(
-        self, followed: FollowedRuns, known: Collection[str]
+        self, followed: FollowedRuns, known: Collection[str], most: int
     ) -> list[tuple[str, Array]]:
         """Return effects of the standard joint model at the joint where most is missing, each with
         its first coefficient (1,): dry and viscous friction, armature, stiffness and damping of the
@@ -528,10 +618,11 @@ class PredictionErrorSearch(Search):
             # A derivative by more friction does not tell what less friction than stated does.
             first[friction] = FIRST_SHARE * min(coefficient_bounds(world, friction)[0][0], 0.0)
         found = [(n, c) for n, c in first.items() if c and n in world.library and n not in known]
-        for gain, name, change in steps[:MAX_JOINT_TRIALS]:
+        for gain, name, change in steps[:most]:
             # Where much process noise hides an effect, its typical size is tried.
             pays = gain > 0.5 * self._penalty(name)
-            found.append((name, change if pays else typical.get(name, 0.0)))
+            first_size = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
+            found.append((name, change if pays else first_size))
         return [(name, np.array([c])) for name, c in found if c]
 
     def _joint_name(self, joint: int) -> str:
@@ -792,7 +883,9 @@ class PredictionErrorSearch(Search):
                 theta[self.world.slots[group.effect]] = self._numbers(group, coefficients)
                 if behind > RIVAL_MARGIN:
                     # Regression is linear; a filter with the rival in the model is not.
-                    followed = self._follow_with(theta, names)
+                    slot = self.world.slots[group.effect]
+                    few = slot.stop - slot.start <= MAX_IMPROVED_SIZE
+                    followed = self._follow_with(theta, names, GAUSS_NEWTON_STEPS if few else 0)
                     if 2.0 * (own - followed.log_likelihood) > RIVAL_MARGIN:
                         continue
                     theta = followed.theta

@@ -3,13 +3,14 @@
 All runs are filtered side by side. With δ the deviation of the state from the motion about which
 the model is linear (`sims.robot.measured`, eqs. (3) and (4)), and r[i] = y[i] - h(x̄[i]),
 
-    δ-[i+1] = A_i δ[i] - d_i,        P-[i+1] = A_i P[i] A_iᵀ + G_i Q G_iᵀ                      (1)
+    δ-[i+1] = A_i δ[i] - d_i,        P-[i+1] = A_i P[i] A_iᵀ + G_i Q G_iᵀ + J_i                (1)
     e[i] = r[i] - H_i δ-[i],         S_i = H_i P- H_iᵀ + R,     K_i = P- H_iᵀ S_i⁻¹            (2)
     δ[i] = δ- + K_i e[i],            P[i] = P- - K_i S_i K_iᵀ                                  (3)
     log L = - Σ_i (log det S_i + e_iᵀ S_i⁻¹ e_i) / 2                                           (4)
 
-(R. E. Kalman 1960, doi:10.1115/1.3662552; F. C. Schweppe 1965, doi:10.1109/TIT.1965.1053737). The
-smoother is that of Bryson and Frazier in its modified form (G. J. Bierman, Automatica 9, 503, 1973,
+with Q the variances of missing forces and J_i those of jumps (`sims.robot.force_limits`). (R. E.
+Kalman 1960, doi:10.1115/1.3662552; F. C. Schweppe 1965, doi:10.1109/TIT.1965.1053737.) The smoother
+is that of Bryson and Frazier in its modified form (G. J. Bierman, Automatica 9, 503, 1973,
 doi:10.1016/0005-1098(73)90076-9): backward, with C_i = I - K_i H_i,
 
     λ_i = C_iᵀ A_iᵀ λ_{i+1} - H_iᵀ S_i⁻¹ e_i
@@ -75,6 +76,7 @@ class LinearRuns:
         recorded: (R, T, C) where a sample was recorded.
         prior: (Z,) standard deviations of the first states.
         step_errors: (R, T - 1, Z) what the steps of the integrator miss.
+        jumps: (R, T - 1, Z) standard deviations of process noise of each state beside the forces.
     """
 
     states: Array
@@ -86,6 +88,7 @@ class LinearRuns:
     recorded: Mask
     prior: Array
     step_errors: Array
+    jumps: Array
 
     def subset(self, chosen: Places) -> LinearRuns:
         """Return some of the runs."""
@@ -99,6 +102,7 @@ class LinearRuns:
             self.recorded[chosen],
             self.prior,
             self.step_errors[chosen],
+            self.jumps[chosen],
         )
 
     def segments(self, length: int) -> LinearRuns:
@@ -124,6 +128,7 @@ class LinearRuns:
             recorded,
             self.prior,
             cut(self.step_errors, last=False),
+            cut(self.jumps, last=False),
         )
 
     @classmethod
@@ -144,6 +149,7 @@ class LinearRuns:
         readings = np.zeros((runs, samples, channels, size))
         residuals = np.zeros(observed.shape)
         errors = np.zeros((runs, samples - 1, size))
+        jumps = np.zeros((runs, samples - 1, size))
         for run, own in enumerate(maps):
             count = len(own.predicted)
             states[run, : count - 1] = own.states
@@ -152,14 +158,16 @@ class LinearRuns:
             inputs[run, : count - 1] = own.inputs
             readings[run, :count] = own.readings
             errors[run, : count - 1] = own.step_errors
+            jumps[run, : count - 1] = own.jumps
             residuals[run, :count] = observed[run, :count] - own.predicted
         recorded = np.isfinite(residuals) & np.isfinite(observed)
         residuals[~recorded] = 0.0
         readings[~recorded] = 0.0
         # A step from where the model explodes tells nothing of the next one.
-        for values in (states, defects, by_force, inputs, readings, errors):
+        for values in (states, defects, by_force, inputs, readings, errors, jumps):
             values[~(np.abs(values) < LARGEST)] = 0.0
-        return cls(states, defects, by_force, inputs, readings, residuals, recorded, prior, errors)
+        stacked = states, defects, by_force, inputs, readings, residuals, recorded
+        return cls(*stacked, prior, errors, jumps)
 
 
 @dataclass(frozen=True)
@@ -238,7 +246,9 @@ def with_coloured_noise(runs: LinearRuns, noise: Noise) -> tuple[LinearRuns, Arr
     states[:, :, :size, :size] = runs.states
     own = size + np.arange(more)
     states[:, :, own, own] = noise.phi[coloured]
-    defects = np.concatenate([runs.defects, np.zeros((number, samples - 1, more))], axis=2)
+    nothing = np.zeros((number, samples - 1, more))
+    defects = np.concatenate([runs.defects, nothing], axis=2)
+    jumps = np.concatenate([runs.jumps, nothing], axis=2)
     # The innovations of the noise are driven like forces, of known variance.
     forces = np.zeros((number, samples - 1, size + more, runs.forces.shape[3] + more))
     forces[:, :, :size, : runs.forces.shape[3]] = runs.forces
@@ -249,7 +259,13 @@ def with_coloured_noise(runs: LinearRuns, noise: Noise) -> tuple[LinearRuns, Arr
     readings[~runs.recorded] = 0.0
     prior = np.concatenate([runs.prior, noise.sigma[coloured]])
     found = replace(
-        runs, states=states, defects=defects, forces=forces, readings=readings, prior=prior
+        runs,
+        states=states,
+        defects=defects,
+        forces=forces,
+        readings=readings,
+        prior=prior,
+        jumps=jumps,
     )
     return found, white
 
@@ -275,7 +291,8 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     likelihood = np.zeros(number)
     filter_recursion(
         *_contiguous(runs.states, runs.defects, runs.forces, runs.readings, runs.residuals),
-        *(variances, runs.prior, _completed(force, runs), LARGEST_COVARIANCE),
+        *(np.square(runs.jumps), variances, runs.prior),
+        *(_completed(force, runs), LARGEST_COVARIANCE),
         *(predicted, covariances, innovations, gains, whiteners, likelihood),
     )
     # Of a model that explodes nothing is known, and its likelihood is zero.

@@ -14,14 +14,17 @@ from bench.gap.prediction_error.state_estimation import (
 
 SAMPLES, SIZE = 12, 2
 SIGMA, FORCE = 0.1, 0.7
+JUMPS = [3, 7]
 
 
-def runs_of(residuals, prior=(0.5, 0.8), samples=None):
+def runs_of(residuals, prior=(0.5, 0.8), with_jumps=False):
     """A body of unit mass whose position is read, with an unknown force between samples."""
     number, samples, _ = residuals.shape
     a = np.array([[1.0, 0.1], [-0.05, 0.98]])
     g = np.array([[0.005], [0.1]])
     shape = (number, samples - 1)
+    jumps = np.zeros((*shape, 2))
+    jumps[:, JUMPS] = 0.3, 2.0
     return LinearRuns(
         states=np.broadcast_to(a, (*shape, 2, 2)).copy(),
         defects=np.broadcast_to([0.01, -0.02], (*shape, 2)).copy(),
@@ -32,22 +35,26 @@ def runs_of(residuals, prior=(0.5, 0.8), samples=None):
         recorded=np.isfinite(residuals),
         prior=np.array(prior),
         step_errors=np.zeros((*shape, 2)),
+        jumps=jumps if with_jumps else np.zeros_like(jumps),
     )
 
 
 def dense(runs, noise):
     """Mean (T,) and covariance of the readings, and the matrix from unknowns to states: the first
-    state in units of its prior, then the forces.
+    state in units of its prior, then the forces, then the jumps.
     """
     samples = runs.residuals.shape[1]
     mean, states = np.zeros(SIZE), [np.zeros(SIZE)]
-    columns = np.concatenate([np.diag(runs.prior), np.zeros((SIZE, samples - 1))], axis=1)
+    more = (1 + SIZE) * (samples - 1)
+    columns = np.concatenate([np.diag(runs.prior), np.zeros((SIZE, more))], axis=1)
     maps = [columns]
     for i in range(samples - 1):
         a, g = runs.states[0, i], runs.forces[0, i, :, 0]
         mean = a @ mean - runs.defects[0, i]
         columns = a @ columns
         columns[:, SIZE + i] += FORCE * g
+        first = SIZE + samples - 1 + SIZE * i
+        columns[:, first : first + SIZE] += np.diag(runs.jumps[0, i])
         states.append(mean)
         maps.append(columns)
     maps, states = np.array(maps), np.array(states)
@@ -60,8 +67,9 @@ def residuals():
     return np.random.default_rng(3).normal(size=(1, SAMPLES, 1))
 
 
-def test_the_likelihood_is_that_of_the_joint_distribution(residuals):
-    runs = runs_of(residuals)
+@pytest.mark.parametrize("with_jumps", [False, True])
+def test_the_likelihood_is_that_of_the_joint_distribution(residuals, with_jumps):
+    runs = runs_of(residuals, with_jumps=with_jumps)
     states, _, covariance = dense(runs, SIGMA**2 * np.eye(SAMPLES))
     error = residuals[0, :, 0] - states[:, 0]
     expected = -0.5 * (
@@ -88,15 +96,18 @@ def test_coloured_noise_has_the_covariance_of_a_first_order_process(residuals):
     assert found.log_likelihood[0] == pytest.approx(expected, rel=1e-9)
 
 
-def test_the_smoother_gives_conditional_means(residuals):
-    runs = runs_of(residuals)
+@pytest.mark.parametrize("with_jumps", [False, True])
+def test_the_smoother_gives_conditional_means(residuals, with_jumps):
+    runs = runs_of(residuals, with_jumps=with_jumps)
     states, maps, covariance = dense(runs, SIGMA**2 * np.eye(SAMPLES))
     error = residuals[0, :, 0] - states[:, 0]
     unknowns = maps[:, 0].T @ np.linalg.solve(covariance, error)
     force = np.array([FORCE])
     found = smooth_runs(runs, filter_runs(runs, force, np.array([SIGMA**2])), force)
     np.testing.assert_allclose(found.states[0], states + maps @ unknowns, atol=1e-10)
-    np.testing.assert_allclose(found.forces[0, :, 0], FORCE * unknowns[SIZE:], atol=1e-10)
+    np.testing.assert_allclose(
+        found.forces[0, :, 0], FORCE * unknowns[SIZE : SIZE + SAMPLES - 1], atol=1e-10
+    )
 
 
 def test_a_missing_sample_is_no_sample(residuals):

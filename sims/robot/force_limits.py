@@ -1,0 +1,118 @@
+"""Joints at which a servo that reaches its force limit makes a motion jump.
+
+MuJoCo's implicit integrators treat the velocity gain kv of a servo implicitly, except in a step in
+which its force F is at a limit (`mjd_smooth_vel`: a clamped force does not depend on the velocity).
+With h the step, M the inertia at the joint, and r = h kv / M, the velocity then changes by h F / M
+in place of h F / (M + h kv), and back in the next step: the position jumps by about
+
+    (h² F / M) r / (1 + r)                                                                      (1)
+
+whenever the force that is commanded crosses the limit, and the other joints by the reaction. A
+linear model tells nothing of such steps.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sims.base import Array
+
+Places = NDArray[np.intp]
+
+STIFF = 0.1
+"""The r from which a servo is stiff."""
+NEAR = 0.9
+"""Share of a limit from which a force may have been at it: its state is not known exactly."""
+LIMIT_FIELDS = ("actuator_force", "qfrc_actuator")
+"""What MuJoCo computes that is limited: forces of actuators, and their sums at joints."""
+
+
+class ForceLimits(NamedTuple):
+    """K force limits of stiff servos.
+
+    Attributes:
+        dofs: (K,) degrees of freedom where they act.
+        fields: of each, which of `LIMIT_FIELDS` it limits.
+        columns: (K,) of this field.
+        sizes: (K,) forces from which they may be reached, in units of the field.
+        jumps: (K, nv) changes of all positions, at the joint by (1).
+    """
+
+    dofs: Places
+    fields: tuple[str, ...]
+    columns: Places
+    sizes: Array
+    jumps: Array
+
+
+def stiff_force_limits(model: Any) -> ForceLimits:
+    """Return the force limits of stiff servos at joints of a MuJoCo model."""
+    import mujoco
+
+    kinds = mujoco.mjtIntegrator
+    implicit = (int(kinds.mjINT_IMPLICIT), int(kinds.mjINT_IMPLICITFAST))
+    rows: list[tuple[int, str, int, float, float]] = []
+    gains = np.zeros(model.nv)
+    if model.opt.integrator in implicit:
+        for k in range(model.nu):
+            dof = _dof(model, k)
+            if dof is None:
+                continue
+            gear = abs(float(model.actuator_gear[k, 0]))
+            gain = -float(model.actuator_biasprm[k, 2]) * gear**2
+            gains[dof] += gain
+            if model.actuator_forcelimited[k] and _is_stiff(model, dof, gain):
+                limit = float(np.abs(model.actuator_forcerange[k]).max())
+                rows.append((dof, LIMIT_FIELDS[0], k, limit, limit * gear))
+        for joint in np.flatnonzero(model.jnt_actfrclimited).tolist():
+            dof = int(model.jnt_dofadr[joint])
+            if _is_stiff(model, dof, float(gains[dof])):
+                limit = float(np.abs(model.jnt_actfrcrange[joint]).max())
+                rows.append((dof, LIMIT_FIELDS[1], dof, limit, limit))
+    dofs = np.array([row[0] for row in rows], dtype=np.intp)
+    return ForceLimits(
+        dofs,
+        tuple(row[1] for row in rows),
+        np.array([row[2] for row in rows], dtype=np.intp),
+        NEAR * np.array([row[3] for row in rows]),
+        np.array([_jump(model, row[0], row[4], gains) for row in rows]).reshape(-1, model.nv),
+    )
+
+
+def _jump(model: Any, dof: int, force: float, gains: Array) -> Array:
+    """What a step with the force of a servo at its limit adds to all positions (nv,); the servos of
+    other joints are not at theirs.
+    """
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    step, others = model.opt.timestep, gains.copy()
+    others[dof] = 0.0
+    unit = np.zeros(model.nv)
+    unit[dof] = force
+    free = np.linalg.solve(inertia + step * np.diag(others), unit)
+    damped = np.linalg.solve(inertia + step * np.diag(gains), unit)
+    jump: Array = step**2 * np.abs(free - damped)
+    return jump
+
+
+def _dof(model: Any, actuator: int) -> int | None:
+    """The degree of freedom on which an actuator acts; None where that is no single joint."""
+    import mujoco
+
+    joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    single = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    joint = int(model.actuator_trnid[actuator, 0])
+    if model.actuator_trntype[actuator] not in joints or model.jnt_type[joint] not in single:
+        return None
+    return int(model.jnt_dofadr[joint])
+
+
+def _is_stiff(model: Any, dof: int, gain: float) -> bool:
+    return bool(model.opt.timestep * gain > STIFF * model.dof_M0[dof])
