@@ -95,6 +95,8 @@ MAX_JOINT_TRIALS = 3
 """Maximum number of effects of the joint and servo models that are tried at each step."""
 MAX_IMPROVED_TRIALS = 3
 """Maximum number of tried effects whose coefficients are improved at each step."""
+MAX_REFINED_SINGLES = 3
+"""Maximum number of effects that are fitted alone until nothing is left to gain."""
 SETTLED_SHARE = 0.1
 """Share of a gain by which another trial must be behind not to be improved."""
 MAX_FIRST_EFFECTS = 2
@@ -109,11 +111,11 @@ MAX_SLOW_EFFECTS = 2
 """Sets of at most so many effects are fitted by simulation even where that is slow."""
 MAX_CACHED_FILTERS = 6
 """Number of filters that are kept for effects that were tried."""
-SOFT_FACTORS = (1.0, 2.0, 4.0)
-"""Multiples of the stiff friction that are tried in the soft form, which is weaker at low speed."""
+SOFT_FACTORS = (0.5, 0.8, 1.2, 1.8)
+"""Multiples of the missing force that are tried as dry friction in the soft form."""
 NEARBY = (0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1)
-"""Factors of a coefficient of dry friction at which a fit looks for a lower cost nearby: where
-joints stick, the cost is not smooth.
+"""Factors of a coefficient at which a fit looks for a lower cost nearby: where joints stick, and
+where servos are at force limits, the cost is not smooth.
 """
 MIN_GAIN_SHARE = 0.3
 """Share of the largest gain by regression that an effect must have to be tried in the model."""
@@ -127,6 +129,9 @@ TRIED_SHARES = (1.0, 0.5)
 """Shares of the coefficients by regression with which a filter must follow the runs better."""
 EXPLAINED_EXCESS = 0.03
 """Excess over the noise below which a fitted set explains the data."""
+
+NEGLIGIBLE_SHARE = 0.005
+"""Share of the base model's excess over the noise below which the search ends."""
 
 
 class SoftFrictionError(Exception):
@@ -287,10 +292,11 @@ class PredictionErrorSearch(Search):
         name = f"friction.coulomb@{self._joint_name(followed.joints_by_loss[0])}"
         if self._is_soft or name not in world.library:
             return
-        step, _ = gauss_newton_step(followed, world.places(name), coefficient_bounds(world, name))
-        for factor in SOFT_FACTORS if step.max() > 0 else ():
+        # A joint that slides lacks about the force of its friction.
+        size = float(followed.force[followed.joints_by_loss[0]])
+        for factor in SOFT_FACTORS:
             start = self._reference.copy()
-            start[world.slots[name]] = self._within_bounds(name, factor * step[world.slots[name]])
+            start[world.slots[name]] = self._within_bounds(name, np.array([factor * size]))
             likelihood = self._likelihood(start, self._soft_simulator)
             if likelihood > best.followed.log_likelihood + 0.5 * SWITCH:
                 raise SoftFrictionError
@@ -388,13 +394,13 @@ class PredictionErrorSearch(Search):
                 break
         if not self._is_explained(best) and not names and not self._must_end:
             self._check_soft_friction(first[0])
+        if not self._is_explained(best) and not names and not self._must_end:
+            best = self._of_higher_merit(best, self._fit_all_servos())
         # Two effects may explain together what neither explains alone.
         for trial in first[: 1 if names else MAX_FIRST_EFFECTS]:
             if self._is_explained(best) or self._must_end:
                 break
             best = self._of_higher_merit(best, self._fit_trial(self._grow(trial)))
-        if not self._is_explained(best) and not names and not self._must_end:
-            best = self._of_higher_merit(best, self._fit_all_servos())
         if not np.isfinite(best.fit.cost) or not best.names:
             return self.base
         if not self._is_explained(best) and is_likelier_soft(self, best, SWITCH):
@@ -412,17 +418,36 @@ class PredictionErrorSearch(Search):
         """
         states = self._first_states(self.follow())
         starts = self._propose_effects(_Trial(self.follow(), ()), len(JOINT_MODEL + SERVO_MODEL))
-        self.refit([replace(start, states=states) for start in starts])
-        found = [
-            self.models[frozenset(s.effects)] for s in starts if frozenset(s.effects) in self.models
-        ]
+        self.refit([replace(start, states=states) for start in starts], race=False)
+        found = [self.models[frozenset(start.effects)] for start in starts]
         best = max(found, key=lambda model: model.merit, default=self.base)
-        if best.names and np.isfinite(best.fit.cost):
-            best = self._fit(best.fit.start())
+        if not self._is_explained(best):
+            best = self._of_higher_merit(best, self._refine_singles(found))
         if self._is_explained(best):
-            return best
+            return self._without_idle_effects(best)
         self._check_soft_friction(_Trial(self._followed_by(best), best.names))
         return self.base
+
+    def _refine_singles(self, models: Sequence[Model]) -> Model:
+        """Fit some effects alone until nothing is left to gain, those of lowest cost first.
+
+        Where joints stick and at force limits the cost is not smooth, so that fits are caught; and
+        likelihoods with coloured noise mean little where much is left over.
+        """
+        starts: list[Start] = []
+        alone = [m for m in models if len(self.world.places(m.names[0])) <= MAX_IMPROVED_SIZE]
+        for model in alone:
+            starts += [model.fit.start(), *self._starts_nearby(model, model.names[0])]
+        costs = costs_of_starts(self.world, self.noise, starts, share=1.0, lost=np.inf)
+        lowest: dict[tuple[str, ...], Start] = {}
+        for i in np.argsort(costs, kind="stable").tolist():
+            lowest.setdefault(starts[i].effects, starts[i])
+        best = self.base
+        for start in list(lowest.values())[:MAX_REFINED_SINGLES]:
+            best = self._of_higher_merit(best, self._fit(start))
+            if self._is_explained(best) or self._must_end:
+                break
+        return best
 
     def _nearly_as_likely(self, tried: Sequence[_Trial]) -> Sequence[_Trial]:
         """The trials that simulation has to decide between, the likeliest first: a filter's model
@@ -849,13 +874,8 @@ class PredictionErrorSearch(Search):
         return found
 
     def _fit_nearby(self, model: Model, name: str) -> Model:
-        """Fit a model again from the best of some coefficients of dry friction nearby."""
-        starts = []
-        for place in self.world.places(name):
-            for factor in NEARBY:
-                theta = model.fit.theta.copy()
-                theta[place] *= factor
-                starts.append(Start(model.names, theta, model.fit.states))
+        """Fit a model again from the best of some coefficients of an effect nearby."""
+        starts = self._starts_nearby(model, name)
         costs = costs_of_starts(self.world, self.noise, starts, share=1.0, lost=np.inf)
         best = int(np.argmin(costs))
         if not costs[best] < model.fit.cost:
@@ -863,9 +883,24 @@ class PredictionErrorSearch(Search):
         self.refit([starts[best]], race=False)
         return self.models[frozenset(model.names)]
 
+    def _starts_nearby(self, model: Model, name: str) -> list[Start]:
+        """Starts with coefficients of an effect nearby. The runs begin where the fit has them
+        begin, or where they are measured to begin.
+        """
+        starts = []
+        for place in self.world.places(name):
+            for factor in NEARBY:
+                theta = model.fit.theta.copy()
+                theta[place] *= factor
+                for states in (model.fit.states, self._first_states(self.follow())):
+                    starts.append(Start(model.names, theta, states))
+        return starts
+
     def _is_explained(self, model: Model) -> bool:
-        """Whether a fitted model leaves no more than noise."""
-        return self.quiet(model) and self.excess(model) < EXPLAINED_EXCESS
+        """Whether a fitted model leaves no more than noise, or next to nothing of a large gap."""
+        left = self.excess(model)
+        noise = left < EXPLAINED_EXCESS and self.quiet(model)
+        return noise or left < NEGLIGIBLE_SHARE * self.excess(self.base)
 
     def fit_rivals(self, best: Model) -> Model:
         """Fit the sets that do nearly as well by the regression, and return the best of all."""
