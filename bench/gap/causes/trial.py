@@ -14,13 +14,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bench.gap.causes.rules import NOTICED, explains, helps, is_alike, is_missed, ratio_of
+from bench.gap.causes.rules import NOTICED, SWITCH, explains, helps, is_alike, is_missed, ratio_of
 from bench.gap.causes.search import IDLE, Search
 from bench.gap.causes.structure import Remains
 from bench.gap.held_out import Measured, Validation
 from bench.gap.model.models import Model, Names
 from sims.base import Array
 
+CLEARLY_CLOSED = 0.5
+"""Share of the excess of fitted runs below which an effect must bring it, to be kept though it is
+hardly seen in that of held-out runs.
+"""
 RICHER = 8
 """So many of the nearest models that contain what was found are tried on held-out runs."""
 
@@ -128,9 +132,13 @@ class Trial:
         excesses = self.excess(without.names), self.excess(having.names)
         if helps((before, after), excesses):
             return True
+        left, closed = search.excess(without), search.excess(having)
+        # Errors of a motion without feedback add up, whatever makes them.
+        better = after > before + SWITCH and excesses[1] < excesses[0]
+        if better and closed < CLEARLY_CLOSED * left:
+            return True
         # A limit that no held-out run comes near has no voice there: chance would speak for it.
         faint = max(excesses) < NOTICED and is_alike(before - after)
-        left, closed = search.excess(without), search.excess(having)
         return faint and left > NOTICED and explains((left - closed) / left)
 
     def misses(self, model: Model, left: Remains) -> bool:

@@ -130,6 +130,12 @@ TRIED_SHARES = (1.0, 0.5)
 EXPLAINED_EXCESS = 0.03
 """Excess over the noise below which a fitted set explains the data."""
 
+LEAST_SHARE = 0.01
+"""Share of the gain of a set by which each further effect must raise it. A model of a real robot is
+never complete, and long recordings show that with certainty.
+"""
+NEARLY_EXPLAINED = 0.1
+"""Share of the base model's excess over the noise below which effects are only added."""
 NEGLIGIBLE_SHARE = 0.005
 """Share of the base model's excess over the noise below which the search ends."""
 
@@ -170,12 +176,14 @@ class PredictionErrorSearch(Search):
         best = friction
         if not self._is_explained(best):
             best = self._of_higher_merit(best, self._fit_quick_selection(selected))
-        if not self._is_explained(best) and not self._must_end and self._lacks_force(self.follow()):
+        if self._goes_on(best) and self._is_nearly_explained(best):
+            best = self._of_higher_merit(best, self._add_to(best))
+        elif self._goes_on(best):
             best = self._of_higher_merit(best, self._fit_single_effects())
-        if not self._is_explained(best) and not self._must_end:
-            best = self._of_higher_merit(best, self._add_to_dry_friction(selected, friction))
-        if not self._is_explained(best) and not self._must_end and self._lacks_force(self.follow()):
-            best = self._of_higher_merit(best, self._select_in_model((), self._reference))
+            if self._goes_on(best):
+                best = self._of_higher_merit(best, self._add_to_dry_friction(selected, friction))
+            if self._goes_on(best):
+                best = self._of_higher_merit(best, self._select_in_model((), self._reference))
         if not self._is_explained(best):
             selected = self._select_with_shapes(selected)
             best = self._of_higher_merit(best, self._fit_quick_selection(selected))
@@ -186,6 +194,23 @@ class PredictionErrorSearch(Search):
         best = self._try_single_effect(best)
         self.supported = best
         return best
+
+    def _goes_on(self, best: Model) -> bool:
+        """Whether effects that regression missed are sought: a force is missing, and there is time
+        left.
+        """
+        lacks = self._lacks_force(self.follow())
+        return lacks and not self._is_explained(best) and not self._must_end
+
+    def _is_nearly_explained(self, model: Model) -> bool:
+        """Whether a model closes most of the gap, so that others need not be tried in its place."""
+        return self.excess(model) < NEARLY_EXPLAINED * self.excess(self.base)
+
+    def _add_to(self, model: Model) -> Model:
+        """Add effects to a fitted model while each pays, and fit the set."""
+        trial = _Trial(self._followed_by(model), model.names)
+        larger = self._grow(trial)
+        return model if larger is trial else self._without_idle_effects(self._fit_trial(larger))
 
     def _fit_series_effects(self, selected: Selected) -> Model:
         """Fit elastic joints and play between drive and links, at the joint where most is missing.
@@ -319,20 +344,28 @@ class PredictionErrorSearch(Search):
 
         Return the base model where that is slow and a force is missing all the same.
         """
-        large = len(selected.groups) > MAX_SLOW_EFFECTS
-        if large and self._is_slow(selected) and self._lacks_force(selected.followed):
+        kept = self._without_surplus(selected)
+        large = len(kept.groups) > MAX_SLOW_EFFECTS
+        if large and self._is_slow(kept) and self._lacks_force(selected.followed):
             return self.base
-        if not selected.groups or not self._pays(selected):
-            return self.base
-        return self._fit_selection(selected)
+        return self._fit_selection(kept)
 
-    def _pays(self, selected: Selected) -> bool:
-        """Whether a filter with the selected set in the model is so much likelier than without it
-        that the set pays. Far from the base model, the regression is wrong.
+    def _without_surplus(self, selected: Selected) -> Selected:
+        """Leave out the last effects of a selection that gain little when a filter has the set in
+        the model: far from the base model a regression is wrong.
         """
-        theta = self._start(selected.groups, selected.coefficients).theta
-        gain = self._likelihood(theta) - self.follow().log_likelihood
-        return 2.0 * gain > sum(self._penalty(name) for name in selected.effects)
+        own = self.follow().log_likelihood
+        best, kept, gained = 0.0, 0, 0.0
+        found: list[Array] = []
+        for count in range(1, len(selected.groups) + 1):
+            groups = selected.groups[:count]
+            coefficients = selected.regression.solve(groups)[1]
+            gain = 2.0 * (self._likelihood(self._start(groups, coefficients).theta) - own)
+            penalty = sum(self._penalty(group.effect) for group in groups)
+            least = LEAST_SHARE * max(gained, 0.0) * (count - kept)
+            if gain - penalty > best and gain - gained > least:
+                best, kept, gained, found = gain - penalty, count, gain, coefficients
+        return replace(selected, groups=selected.groups[:kept], coefficients=found)
 
     def _select_with_shapes(self, selected: Selected) -> Selected:
         """Select again with effects of many shapes, at the joints where a force is missing."""
@@ -488,10 +521,11 @@ class PredictionErrorSearch(Search):
     def _larger_that_pay(self, trial: _Trial) -> list[_Trial]:
         """Trials with one more effect whose likelihood pays for it, the likeliest first."""
         own = trial.followed.log_likelihood
+        share = LEAST_SHARE * 2.0 * (own - self.follow().log_likelihood)
         return [
             one
             for one in self._try_one_more(trial)
-            if 2.0 * (one.followed.log_likelihood - own) >= self._penalty(one.names[-1])
+            if 2.0 * (one.followed.log_likelihood - own) >= max(self._penalty(one.names[-1]), share)
         ]
 
     def _try_one_more(self, trial: _Trial) -> list[_Trial]:
