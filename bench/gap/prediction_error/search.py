@@ -75,7 +75,7 @@ RIVAL_MARGIN = 20.0
 """Rivals this near in twice the log likelihood of the regression are fitted by simulation."""
 LINEARISATION_ERROR = 0.03
 """Share of a gain by which it may be wrong, since responses are linear."""
-MAX_RIVALS = 3
+MAX_RIVALS = 5
 """Maximum number of rivals of each effect that are fitted by simulation."""
 ALIKE_SHARE = 0.5
 """Share of an effect's gain by regression that another one at the same joint must have to be
@@ -136,8 +136,8 @@ never complete, and long recordings show that with certainty.
 """
 NEARLY_EXPLAINED = 0.1
 """Share of the base model's excess over the noise below which effects are only added."""
-NEGLIGIBLE_SHARE = 0.005
-"""Share of the base model's excess over the noise below which the search ends."""
+NEGLIGIBLE, NEGLIGIBLE_SHARE = 0.1, 0.005
+"""Excess over the noise, and share of that of the base model, below which the search ends."""
 
 
 class SoftFrictionError(Exception):
@@ -164,7 +164,11 @@ class PredictionErrorSearch(Search):
     _model_columns: dict[bytes, dict[str, list[int]]] = field(default_factory=dict)
 
     def run(self) -> Model:
-        """Return the model of all effects that the data show."""
+        """Return the model of all effects that the data show.
+
+        Raises:
+            SoftFrictionError: dry friction of the data has MuJoCo's soft form.
+        """
         watch = self.world.watch
         self.supported = self.base
         followed = self.follow()
@@ -176,7 +180,10 @@ class PredictionErrorSearch(Search):
         best = friction
         if not self._is_explained(best):
             best = self._of_higher_merit(best, self._fit_quick_selection(selected))
-        if self._goes_on(best) and self._is_nearly_explained(best):
+        nearly = self._is_nearly_explained(best)
+        if self._goes_on(best) and nearly and is_likelier_soft(self, best, SWITCH):
+            raise SoftFrictionError
+        if self._goes_on(best) and nearly and len(best.names) > 1:
             best = self._of_higher_merit(best, self._add_to(best))
         elif self._goes_on(best):
             best = self._of_higher_merit(best, self._fit_single_effects())
@@ -203,7 +210,7 @@ class PredictionErrorSearch(Search):
         return lacks and not self._is_explained(best) and not self._must_end
 
     def _is_nearly_explained(self, model: Model) -> bool:
-        """Whether a model closes most of the gap, so that others need not be tried in its place."""
+        """Whether a model closes most of the gap."""
         return self.excess(model) < NEARLY_EXPLAINED * self.excess(self.base)
 
     def _add_to(self, model: Model) -> Model:
@@ -459,6 +466,8 @@ class PredictionErrorSearch(Search):
         if self._is_explained(best):
             return self._without_idle_effects(best)
         self._check_soft_friction(_Trial(self._followed_by(best), best.names))
+        if is_likelier_soft(self, best, SWITCH):
+            raise SoftFrictionError
         return self.base
 
     def _refine_singles(self, models: Sequence[Model]) -> Model:
@@ -934,7 +943,7 @@ class PredictionErrorSearch(Search):
         """Whether a fitted model leaves no more than noise, or next to nothing of a large gap."""
         left = self.excess(model)
         noise = left < EXPLAINED_EXCESS and self.quiet(model)
-        return noise or left < NEGLIGIBLE_SHARE * self.excess(self.base)
+        return noise or left < min(NEGLIGIBLE, NEGLIGIBLE_SHARE * self.excess(self.base))
 
     def fit_rivals(self, best: Model) -> Model:
         """Fit the sets that do nearly as well by the regression, and return the best of all."""
