@@ -52,6 +52,8 @@ LARGEST = 1e12
 """Derivatives and defects beyond it are those of a model that explodes, and left out."""
 LARGEST_COVARIANCE = 1e8
 """Variances of predicted states are limited to it, in SI units squared."""
+LARGEST_LOSS = 1e30
+"""Negative log likelihood beyond which a model explodes."""
 SEGMENT = 80
 """Number of samples of a segment on which the process noise is fitted."""
 ITERATIONS = 12
@@ -296,7 +298,7 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
         *(predicted, covariances, innovations, gains, whiteners, likelihood),
     )
     # Of a model that explodes nothing is known, and its likelihood is zero.
-    likelihood = np.nan_to_num(likelihood, nan=-np.inf)
+    likelihood = np.where(likelihood > -LARGEST_LOSS, likelihood, -np.inf)
     return Filtered(predicted, covariances, innovations, gains, whiteners, likelihood)
 
 
