@@ -53,6 +53,7 @@ from bench.gap.prediction_error.null_distribution import null_scores, p_value_of
 from bench.gap.prediction_error.selection import Regression
 from sims.base import Array
 from sims.robot.forces import OVER_TIME
+from sims.robot.loops import coupled_joints
 from sims.robot.native import FIELDS
 from sims.robot.scales import scales
 from sims.robot.series import is_series
@@ -113,7 +114,7 @@ MAX_CACHED_FILTERS = 6
 """Number of filters that are kept for effects that were tried."""
 SOFT_FACTORS = (0.5, 0.8, 1.2, 1.8)
 """Multiples of the missing force that are tried as dry friction in the soft form."""
-NEARBY = (0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1)
+NEARBY = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)
 """Factors of a coefficient at which a fit looks for a lower cost nearby: where joints stick, and
 where servos are at force limits, the cost is not smooth.
 """
@@ -480,13 +481,18 @@ class PredictionErrorSearch(Search):
         alone = [m for m in models if len(self.world.places(m.names[0])) <= MAX_IMPROVED_SIZE]
         for model in alone:
             starts += [model.fit.start(), *self._starts_nearby(model, model.names[0])]
+        if not starts:
+            return self.base
         costs = costs_of_starts(self.world, self.noise, starts, share=1.0, lost=np.inf)
         lowest: dict[tuple[str, ...], Start] = {}
         for i in np.argsort(costs, kind="stable").tolist():
             lowest.setdefault(starts[i].effects, starts[i])
         best = self.base
         for start in list(lowest.values())[:MAX_REFINED_SINGLES]:
-            best = self._of_higher_merit(best, self._fit(start))
+            fitted = self._fit(start)
+            if not self._is_at_noise(fitted) and self._is_nearly_explained(fitted):
+                fitted = self._fit_nearby(fitted, fitted.names[0])
+            best = self._of_higher_merit(best, fitted)
             if self._is_explained(best) or self._must_end:
                 break
         return best
@@ -941,9 +947,12 @@ class PredictionErrorSearch(Search):
 
     def _is_explained(self, model: Model) -> bool:
         """Whether a fitted model leaves no more than noise, or next to nothing of a large gap."""
-        left = self.excess(model)
-        noise = left < EXPLAINED_EXCESS and self.quiet(model)
-        return noise or left < min(NEGLIGIBLE, NEGLIGIBLE_SHARE * self.excess(self.base))
+        share = NEGLIGIBLE_SHARE * self.excess(self.base)
+        return self._is_at_noise(model) or self.excess(model) < min(NEGLIGIBLE, share)
+
+    def _is_at_noise(self, model: Model) -> bool:
+        """Whether a fitted model leaves no more than noise."""
+        return self.quiet(model) and self.excess(model) < EXPLAINED_EXCESS
 
     def fit_rivals(self, best: Model) -> Model:
         """Fit the sets that do nearly as well by the regression, and return the best of all."""
@@ -971,6 +980,19 @@ class PredictionErrorSearch(Search):
         if starts:
             self.refit(starts, race=False)
         size = len(best.names)
+        if size == 1 and self.follow().runs.jumps.any():
+            # Fits at force limits are caught.
+            known = [m for m in self.models.values() if len(m.names) == 1 and m is not best]
+            laws = JOINT_MODEL + SERVO_MODEL
+            self._refine_singles([m for m in known if m.names[0].partition("@")[0] in laws])
+        elsewhere = [
+            start
+            for model in self._near_the_best(size)
+            for name in model.names
+            for start in self._at_coupled_joints(model, name)
+        ]
+        if elsewhere:
+            self.refit(list({frozenset(s.effects): s for s in elsewhere}.values()), race=False)
         self._refine_near(size)
         likeliest = self.best(size)
         return best if likeliest is None else likeliest
@@ -979,14 +1001,9 @@ class PredictionErrorSearch(Search):
         """Fit the models with so many effects that do nearly as well as the best until nothing is
         left to gain, so that incomplete fits do not decide between them.
         """
-        likeliest = self.best(size)
-        if likeliest is None or self._must_end:
+        near = self._near_the_best(size)
+        if self._must_end:
             return
-        near = [
-            model
-            for model in self.models.values()
-            if len(model.names) == size and model.merit > likeliest.merit - RIVAL_MARGIN
-        ]
         if len(near) < 2:
             return
         fitter = Fitter(self.world, self.noise, self.frozen, exact=True)
@@ -1022,6 +1039,44 @@ class PredictionErrorSearch(Search):
                 near_count += is_near
                 found[group.effect] = group, rest.solve([group])[1][0], behind
         return list(found.values())
+
+    def _near_the_best(self, size: int) -> list[Model]:
+        """The models with so many effects that do nearly as well as the best of them."""
+        likeliest = self.best(size)
+        return [
+            model
+            for model in self.models.values()
+            if likeliest is not None
+            and len(model.names) == size
+            and model.merit > likeliest.merit - RIVAL_MARGIN
+        ]
+
+    def _at_coupled_joints(self, model: Model, name: str) -> list[Start]:
+        """Starts with an effect of a model at the other joints of its loop, where it may do the
+        same: a filter tells little of joints that are not measured.
+        """
+        law, _, joint = name.partition("@")
+        coordinates = [one.removeprefix("q.") for one in self.world.simulator.system.coordinates]
+        if joint not in coordinates:
+            return []
+        number, slots = coordinates.index(joint), self.world.slots
+        others = {k for group in self._loops if number in group for k in group} - {number}
+        starts = []
+        for other in (f"{law}@{coordinates[k]}" for k in sorted(others)):
+            names = (*(one for one in model.names if one != name), other)
+            if other not in slots or other in model.names or frozenset(names) in self.models:
+                continue
+            theta = model.fit.theta.copy()
+            theta[slots[other]], theta[slots[name]] = theta[slots[name]], 0.0
+            starts.append(Start(names, theta, model.fit.states))
+        return starts
+
+    @cached_property
+    def _loops(self) -> list[set[int]]:
+        """Numbers of the joints that constraints couple."""
+        assert isinstance(self.world.simulator, RobotSimulator)
+        model = self.world.simulator.wide().model
+        return coupled_joints(model, self.world.simulator.addresses.velocities.tolist())
 
     def _joint_models_where_acts(self, name: str) -> set[str]:
         """The effects of the joint and servo models at the joint where an effect acts."""

@@ -1,0 +1,59 @@
+"""Joints that constraints couple: those of a closed loop, and those of an equality of joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+
+def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
+    """Return the groups of joints that constraints of a MuJoCo model couple.
+
+    A `connect` or `weld` couples the joints between its bodies and their common ancestor; an
+    equality of joints couples these.
+
+    Args:
+        model: MuJoCo's.
+        dofs: degree of freedom of each joint.
+
+    Returns:
+        Sets of numbers of joints, each of two at least; sets that share a joint are one.
+    """
+    import mujoco
+
+    number = {int(dof): joint for joint, dof in enumerate(dofs)}
+    kinds, objects = mujoco.mjtEq, mujoco.mjtObj
+    groups: list[set[int]] = []
+    for k in range(model.neq):
+        kind, first, second = (
+            int(model.eq_type[k]),
+            *map(int, (model.eq_obj1id[k], model.eq_obj2id[k])),
+        )
+        if kind == int(kinds.mjEQ_JOINT):
+            ends = [int(model.jnt_dofadr[joint]) for joint in (first, second) if joint >= 0]
+        elif kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
+            if int(model.eq_objtype[k]) == int(objects.mjOBJ_SITE):
+                first, second = (int(model.site_bodyid[site]) for site in (first, second))
+            one, other = _ancestors(model, first), _ancestors(model, second)
+            ends = [dof for body in set(one) ^ set(other) for dof in _dofs_of(model, body)]
+        else:
+            continue
+        group = {number[dof] for dof in ends if dof in number}
+        joined = [known for known in groups if known & group]
+        groups = [known for known in groups if not known & group]
+        groups.append(group.union(*joined))
+    return [group for group in groups if len(group) > 1]
+
+
+def _ancestors(model: Any, body: int) -> list[int]:
+    """A body and all bodies between it and the world."""
+    found = [body]
+    while body > 0:
+        body = int(model.body_parentid[body])
+        found.append(body)
+    return found
+
+
+def _dofs_of(model: Any, body: int) -> range:
+    first = int(model.body_dofadr[body])
+    return range(first, first + int(model.body_dofnum[body])) if first >= 0 else range(0)
