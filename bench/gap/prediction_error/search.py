@@ -438,7 +438,7 @@ class PredictionErrorSearch(Search):
         if not self._is_explained(best) and not names and not self._must_end:
             best = self._of_higher_merit(best, self._fit_all_servos())
         # Two effects may explain together what neither explains alone.
-        for trial in first[: 1 if names else MAX_FIRST_EFFECTS]:
+        for trial in first[:1]:
             if self._is_explained(best) or self._must_end:
                 break
             best = self._of_higher_merit(best, self._fit_trial(self._grow(trial)))
