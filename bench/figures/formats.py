@@ -31,3 +31,17 @@ def pdf_figures(wanted: bool = True) -> Iterator[None]:
 def is_pdf_wanted() -> bool:
     """Whether a PDF file is asked for."""
     return _WANTED.get()
+
+
+_command = False
+
+
+def run_as_command() -> None:
+    """Say that this process runs a command, and no session in which somebody asks for help."""
+    global _command
+    _command = True
+
+
+def shows_no_help() -> bool:
+    """Whether the docstrings of libraries are shown to nobody."""
+    return _command

@@ -2,9 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 
-from matplotlib.figure import Figure
+import matplotlib.artist
+
+from bench.figures.formats import shows_no_help
+
+
+@contextmanager
+def _without_tables_of_properties() -> Iterator[None]:
+    """Load Matplotlib without the tables of properties in its docstrings, which take a sixth of the
+    time, where nobody can ask for them.
+    """
+    name, tables = "kwdoc", matplotlib.artist.kwdoc
+    if shows_no_help():
+        setattr(matplotlib.artist, name, lambda artist: "")  # noqa: ARG005
+    try:
+        yield
+    finally:
+        setattr(matplotlib.artist, name, tables)
+
+
+with _without_tables_of_properties():
+    from matplotlib.figure import Figure
 
 
 class Picture(Figure):
