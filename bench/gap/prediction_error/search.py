@@ -947,8 +947,12 @@ class PredictionErrorSearch(Search):
 
     def _is_explained(self, model: Model) -> bool:
         """Whether a fitted model leaves no more than noise, or next to nothing of a large gap."""
+        if self._is_at_noise(model):
+            return True
+        # What is left beside dry friction may be its other form.
+        friction = has_dry_friction(self.world, model.names) and not self._is_soft
         share = NEGLIGIBLE_SHARE * self.excess(self.base)
-        return self._is_at_noise(model) or self.excess(model) < min(NEGLIGIBLE, share)
+        return not friction and self.excess(model) < min(NEGLIGIBLE, share)
 
     def _is_at_noise(self, model: Model) -> bool:
         """Whether a fitted model leaves no more than noise."""
