@@ -82,8 +82,8 @@ COMMANDS = (
 )
 """Name, what adds its options, and its line of help, in the order of `simgap --help`."""
 
-GARBAGE = 50_000
-"""New objects after which garbage is collected; Python's default is 700 or 2,000."""
+GARBAGE_THRESHOLD = 50_000
+"""Number of new objects after which garbage is collected; Python's default is 700 or 2,000."""
 
 
 class _UsageError(Exception):
@@ -117,15 +117,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         printer.fault("usage", str(error), FAULT)
         sys.exit(FAULT)
     # After the parser, which has ended the quick `--help`.
-    from bench.figures.formats import pdf_figures, run_as_command
+    from bench.figures.formats import mark_as_command, pdf_figures
     from sims.base import InputError
 
     if arguments is None:
         # Only in a process of its own: a caller's environment is not changed.
         _name_glfw_library()
-        run_as_command()
+        mark_as_command()
         # Most of what a command makes while it loads modules stays.
-        gc.set_threshold(GARBAGE)
+        gc.set_threshold(GARBAGE_THRESHOLD)
     try:
         with printer.working(), pdf_figures(getattr(options, "pdf", False)):
             answer: Answer = options.command(options, printer.say)

@@ -36,12 +36,12 @@ def is_pdf_wanted() -> bool:
 _command = False
 
 
-def run_as_command() -> None:
-    """Say that this process runs a command, and no session in which somebody asks for help."""
+def mark_as_command() -> None:
+    """Record that this process runs a command and is no interactive session."""
     global _command
     _command = True
 
 
-def shows_no_help() -> bool:
-    """Whether the docstrings of libraries are shown to nobody."""
+def is_command() -> bool:
+    """Whether this process runs a command, which shows no docstrings of libraries."""
     return _command

@@ -8,21 +8,25 @@ from io import BytesIO
 
 import matplotlib.artist
 
-from bench.figures.formats import shows_no_help
+from bench.figures.formats import is_command
 
 
 @contextmanager
 def _without_tables_of_properties() -> Iterator[None]:
-    """Load Matplotlib without the tables of properties in its docstrings, which take a sixth of the
-    time, where nobody can ask for them.
+    """Load Matplotlib without the tables of properties in its docstrings in a command: they take a
+    sixth of the time of the import.
     """
-    name, tables = "kwdoc", matplotlib.artist.kwdoc
-    if shows_no_help():
-        setattr(matplotlib.artist, name, lambda artist: "")  # noqa: ARG005
+    tables = matplotlib.artist.kwdoc
+    if is_command():
+        matplotlib.artist.kwdoc = _no_table
     try:
         yield
     finally:
-        setattr(matplotlib.artist, name, tables)
+        matplotlib.artist.kwdoc = tables
+
+
+def _no_table(artist: object) -> str:  # noqa: ARG001
+    return ""
 
 
 with _without_tables_of_properties():

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 from sims.base import Array
 from sims.robot import contacts
 from sims.robot.floating import Afloat, Floating
+from sims.robot.force_limits import ForceLimits, stiff_force_limits
 from sims.robot.midway import Look, Mask, Midway, Places
 from sims.robot.model import Robot
 from sims.robot.native import COUPLING, FIELDS, lanes_spec, write_friction_form
@@ -169,6 +171,11 @@ class Bench:
     def model(self) -> Any:
         """The mujoco.MjModel that lanes share but for their fields."""
         return self.batch.model
+
+    @cached_property
+    def force_limits(self) -> ForceLimits:
+        """Force limits of stiff servos."""
+        return stiff_force_limits(self.model)
 
     @property
     def nbytes(self) -> int:

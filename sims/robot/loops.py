@@ -25,10 +25,8 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
     kinds, objects = mujoco.mjtEq, mujoco.mjtObj
     groups: list[set[int]] = []
     for k in range(model.neq):
-        kind, first, second = (
-            int(model.eq_type[k]),
-            *map(int, (model.eq_obj1id[k], model.eq_obj2id[k])),
-        )
+        kind = int(model.eq_type[k])
+        first, second = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
         if kind == int(kinds.mjEQ_JOINT):
             ends = [int(model.jnt_dofadr[joint]) for joint in (first, second) if joint >= 0]
         elif kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):

@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 from sims.base import Array, Scenario
 from sims.robot.floating import Afloat
-from sims.robot.force_limits import stiff_force_limits
 from sims.robot.forces import LOADED
 from sims.robot.instants import HELD, SIDES, Instants, Motion
 from sims.robot.linear import Added, Linear
@@ -239,7 +238,7 @@ class MeasuredLinear(Linear):
     def _jumps(self) -> Array:
         """(T - 1, Z) standard deviations of the jumps at force limits of stiff servos."""
         bench = self._simulator.wide(self._work.acting)
-        limits = stiff_force_limits(bench.model)
+        limits = bench.force_limits
         result = np.zeros((self.knots.size - 1, self._tangent.size))
         if not limits.dofs.size:
             return result

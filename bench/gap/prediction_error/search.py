@@ -101,7 +101,7 @@ MAX_REFINED_SINGLES = 3
 SETTLED_SHARE = 0.1
 """Share of a gain by which another trial must be behind not to be improved."""
 MAX_FIRST_EFFECTS = 2
-"""Maximum number of effects from which a set is grown."""
+"""Number of the likeliest trials that are fitted by simulation, however far behind the best."""
 ALL_SERVOS_STEPS = 6
 """Maximum number of Gauss-Newton steps for the coefficients of all servos."""
 OFFSET_THRESHOLD = 10.0
@@ -315,24 +315,32 @@ class PredictionErrorSearch(Search):
         return self._select_in_model(plain, self._friction_of(selected, plain))
 
     def _check_soft_friction(self, best: _Trial) -> None:
-        """Follow the runs with dry friction in MuJoCo's soft form at the joint where most is
-        missing.
+        """Compare a trial with dry friction in MuJoCo's soft form.
 
         Raises:
-            SoftFrictionError: that is likelier than the best trial.
+            SoftFrictionError: that is likelier than the trial.
+        """
+        if self._soft_friction_likelihood > best.followed.log_likelihood + 0.5 * SWITCH:
+            raise SoftFrictionError
+
+    @cached_property
+    def _soft_friction_likelihood(self) -> float:
+        """Largest log likelihood with soft dry friction at the joint where most is missing; minus
+        infinity where there is none.
         """
         world, followed = self.world, self.follow()
-        name = f"friction.coulomb@{self._joint_name(followed.joints_by_loss[0])}"
+        joint = followed.joints_by_loss[0]
+        name = f"friction.coulomb@{self._joint_name(joint)}"
         if self._is_soft or name not in world.library:
-            return
-        # A joint that slides lacks about the force of its friction.
-        size = float(followed.force[followed.joints_by_loss[0]])
+            return -np.inf
+        found = []
         for factor in SOFT_FACTORS:
             start = self._reference.copy()
-            start[world.slots[name]] = self._within_bounds(name, np.array([factor * size]))
-            likelihood = self._likelihood(start, self._soft_simulator)
-            if likelihood > best.followed.log_likelihood + 0.5 * SWITCH:
-                raise SoftFrictionError
+            # A joint that slides lacks about the force of its friction.
+            size = np.array([factor * float(followed.force[joint])])
+            start[world.slots[name]] = self._within_bounds(name, size)
+            found.append(self._likelihood(start, self._soft_simulator))
+        return max(found)
 
     def _plain_friction(self, selected: Selected) -> tuple[str, ...]:
         """The dry friction of a selection, without a state; a family in place of its members."""
@@ -435,13 +443,10 @@ class PredictionErrorSearch(Search):
                 break
         if not self._is_explained(best) and not names and not self._must_end:
             self._check_soft_friction(first[0])
-        if not self._is_explained(best) and not names and not self._must_end:
             best = self._of_higher_merit(best, self._fit_all_servos())
         # Two effects may explain together what neither explains alone.
-        for trial in first[:1]:
-            if self._is_explained(best) or self._must_end:
-                break
-            best = self._of_higher_merit(best, self._fit_trial(self._grow(trial)))
+        if first and not self._is_explained(best) and not self._must_end:
+            best = self._of_higher_merit(best, self._fit_trial(self._grow(first[0])))
         if not np.isfinite(best.fit.cost) or not best.names:
             return self.base
         if not self._is_explained(best) and is_likelier_soft(self, best, SWITCH):
@@ -949,7 +954,7 @@ class PredictionErrorSearch(Search):
         """Whether a fitted model leaves no more than noise, or next to nothing of a large gap."""
         if self._is_at_noise(model):
             return True
-        # What is left beside dry friction may be its other form.
+        # Friction of the other form leaves a small residual.
         friction = has_dry_friction(self.world, model.names) and not self._is_soft
         share = NEGLIGIBLE_SHARE * self.excess(self.base)
         return not friction and self.excess(model) < min(NEGLIGIBLE, share)
@@ -1002,13 +1007,11 @@ class PredictionErrorSearch(Search):
         return best if likeliest is None else likeliest
 
     def _refine_near(self, size: int) -> None:
-        """Fit the models with so many effects that do nearly as well as the best until nothing is
-        left to gain, so that incomplete fits do not decide between them.
+        """Fit the models of a size whose merit is near the best until nothing is left to gain, so
+        that incomplete fits do not decide between them.
         """
         near = self._near_the_best(size)
-        if self._must_end:
-            return
-        if len(near) < 2:
+        if self._must_end or len(near) < 2:
             return
         fitter = Fitter(self.world, self.noise, self.frozen, exact=True)
         for model, fit in zip(near, fitter.fit([m.fit.start() for m in near], STEPS), strict=True):
@@ -1045,7 +1048,7 @@ class PredictionErrorSearch(Search):
         return list(found.values())
 
     def _near_the_best(self, size: int) -> list[Model]:
-        """The models with so many effects that do nearly as well as the best of them."""
+        """The models with a number of effects whose merit is near that of the best of them."""
         likeliest = self.best(size)
         return [
             model

@@ -5,7 +5,7 @@ LOADED = """
 import sys
 from bench.figures import formats
 if sys.argv[1] == "command":
-    formats.run_as_command()
+    formats.mark_as_command()
 from bench.figures.picture import Picture
 import matplotlib.artist
 from matplotlib.axes import Axes
