@@ -10,7 +10,7 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -65,6 +65,8 @@ SOFT_FRICTION = (
     "it fits better than stiff friction"
 )
 """Message to the user where the form of dry friction changes."""
+STIFF_FRICTION = "soft dry friction leaves a gap all the same: stiff friction is used"
+"""Message to the user where it changes back."""
 if TYPE_CHECKING:
     from bench.gap.model.numerics import Finer
     from bench.gap.prediction_error.candidate_responses import FollowedRuns
@@ -75,6 +77,8 @@ SPARE = 4
 """Samples that there must be besides."""
 HUGE = 1e9
 """Values so many times a channel's typical size are none."""
+EXPLAINED = ("adequate", "named", "ambiguous")
+"""Verdicts that leave no more than noise."""
 Say = Callable[[str], None]
 Source: TypeAlias = str | Path | Recording
 
@@ -365,8 +369,9 @@ class _Explainer:
         if not self.kind.has_model:
             return _Found(base, search, self._finding(search), rng)
         # Loaded where there is a robot alone.
-        from bench.gap.prediction_error.search import SoftFrictionError
+        from bench.gap.prediction_error.search import PredictionErrorSearch, SoftFrictionError
 
+        stiff = _Worlds(self.kind, self.fitting, self.validation)
         try:
             found = _Found(base, search, self._finding(search), rng)
             # A search does not select dry friction that is a free number.
@@ -374,18 +379,53 @@ class _Explainer:
             done = self.watch.left() or bool(self.faults) or not is_free
             if done or not is_likelier_soft(search, found.finding.model, SWITCH):
                 return found
-        except SoftFrictionError:
-            pass
-        self.say(SOFT_FRICTION)
+            return self._searched_soft(base, search)
+        except SoftFrictionError as error:
+            soft = self._searched_soft(base, search, error.start)
+            if not error.is_preliminary or self._is_explained(soft) or self.watch.left():
+                return soft
+        self.say(STIFF_FRICTION)
         before = self.assessor.before
+        self._return(stiff, before)
+        again = self._search(base, rng)
+        assert isinstance(again, PredictionErrorSearch)
+        again.is_form_given = True
+        try:
+            return _Found(base, again, self._finding(again), rng)
+        except SoftFrictionError as error:
+            return self._searched_soft(base, search, error.start)
+
+    @staticmethod
+    def _is_explained(found: _Found) -> bool:
+        """Whether an answer leaves no more than noise."""
+        return found.finding.verdict in EXPLAINED
+
+    def _searched_soft(self, base: Base, before: Search, likely: Start | None = None) -> _Found:
+        """Search and judge with MuJoCo's soft dry friction.
+
+        Args:
+            base: the base model.
+            before: the search with stiff friction.
+            likely: a model that may explain the runs.
+        """
+        # Loaded where there is a robot alone.
+        from bench.gap.prediction_error.search import PredictionErrorSearch
+
+        self.say(SOFT_FRICTION)
+        held_out = self.assessor.before
         self._enter(soft_kind(self.kind))
-        self.assessor = replace(self.assessor, before=before)
+        self.assessor = replace(self.assessor, before=held_out)
         fitter = Fitter(self.fitting, self.noise, base.frozen)
         start = replace(base.fit.start(), states=self.fitting.guess)
         (fit,) = fitter.fit([start], LAST_STEPS)
         base = self._without_step(replace(base, fit=fit))
         rng = self._rng()
         search = self._search(base, rng)
+        if isinstance(search, PredictionErrorSearch) and isinstance(before, PredictionErrorSearch):
+            search.likely = likely
+            robot: Any = self.kind
+            if not robot.robot.compiled.dof_frictionloss.any():
+                search.take_over(before)
         return _Found(base, search, self._finding(search), rng)
 
     def _answered(self, base: Base) -> _Found:
@@ -417,7 +457,7 @@ class _Explainer:
 
     def _unexplained(self, search: Search, finding: Finding) -> tuple[RecordingFault, ...]:
         """Wrong units and signs of a robot's recording that no effect explains."""
-        explained = finding.verdict in ("adequate", "named", "ambiguous")
+        explained = finding.verdict in EXPLAINED
         if not self._asks_units_late or explained or self.watch.left():
             return ()
         base = Base(search.base.fit, frozenset(search.frozen))
@@ -507,17 +547,20 @@ class _Explainer:
         # Loaded where there is a robot alone.
         from bench.gap.prediction_error.candidate_responses import FollowedRuns
 
-        followed = []
-        for world in self._worlds():
-            self.watch.stage("following the runs with the model")
-            followed.append(FollowedRuns.follow(world, world.nominal(), self.noise, None))
+        self.watch.stage("following the runs with the model")
+        world, *held_out = self._worlds()
+        followed = FollowedRuns.follow(world, world.nominal(), self.noise, None)
         # Where the linear model diverges, causes are searched by simulation.
-        if not all(one.is_sound for one in followed):
+        if not followed.is_sound:
             return
         if self.free_numbers and self.tuner is None:
-            followed[0] = self._identified(followed[0])
-        for world, one in zip(self._worlds(), followed, strict=True):
-            world.follow(one)
+            followed = self._identified(followed)
+        world.follow(followed)
+        for world in held_out:
+            # Held-out runs are simulated alone, and begin at their readings without a filter.
+            found = FollowedRuns.follow(world, world.nominal(), self.noise, None)
+            if found.is_sound:
+                world.follow(found)
 
     def _identified(self, followed: FollowedRuns) -> FollowedRuns:
         """The runs, filtered with base parameters that are identified by prediction errors."""

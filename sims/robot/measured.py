@@ -102,7 +102,8 @@ class MeasuredLinear(Linear):
         trajectory: the motion.
         measured: in its place, (T, 3) position, velocity and acceleration at the samples of joints,
             by their numbers; all others move as they are simulated.
-        nearby: the linear model of a motion nearby, whose Jacobians are used again.
+        nearby: the linear model of a motion nearby, whose commands and readings are used again.
+        is_alike: whether its Jacobians are used again as well.
     """
 
     def __init__(
@@ -114,9 +115,10 @@ class MeasuredLinear(Linear):
         trajectory: Trajectory | None = None,
         measured: Mapping[int, Array] | None = None,
         nearby: MeasuredLinear | None = None,
+        is_alike: bool = True,
     ) -> None:
         self._given, self._measured, self._nearby = trajectory, measured or {}, nearby
-        if nearby is not None:
+        if nearby is not None and is_alike:
             self.quotients = nearby._tangent.quotients
         spacing = float(np.median(np.diff(scenario.times))) if scenario.times.size > 1 else 0.0
         self.held = float(np.clip(spacing, HELD, LONGEST_HELD))

@@ -161,7 +161,7 @@ class Fitter:
             begun = self._plain_points([(p, p.point.start) for p in nearby], seen)
             for problem, point in zip(nearby, begun, strict=True):
                 assert point.start.known is not None
-                own = self._begun(point.start, point.simulated.shape[1])
+                own = self._begun(problem, point.start, point.simulated.shape[1])
                 known = point.start.known.jacobian[:, : point.simulated.shape[1]]
                 self._take(problem, replace(point, jacobian=np.concatenate([known, own], axis=3)))
                 problem.here = False
@@ -178,6 +178,14 @@ class Fitter:
         stale = [p for p in problems if p.stale and not p.done and (waiting or not p.waits)]
         if not stale:
             return
+        for problem in stale:
+            problem.renewals += 1
+            if problem.needs_own_states:
+                # Loaded where there is a robot alone.
+                from bench.gap.model.tangents import begun_about
+
+                at = problem.point.start
+                problem.by_states = begun_about(self.world, at.theta, at.states)
         points = self._points([(p, p.point.start) for p in stale], seen)
         for problem, point in zip(stale, points, strict=True):
             self._take(problem, point)
@@ -247,7 +255,7 @@ class Fitter:
             first = last
             jacobian = self._derivatives(part, step, unknown)
             if self.world.linear:
-                jacobian[..., problem.free.size :] = self._begun(start, part.shape[2])
+                jacobian[..., problem.free.size :] = self._begun(problem, start, part.shape[2])
             cost = self._cost(part[0], start.states, seen)
             points.append(Point(start, part[0], jacobian, cost))
         return points
@@ -274,15 +282,18 @@ class Fitter:
             return np.array([], dtype=np.intp)
         return np.flatnonzero(~self.world.known.all(axis=0))
 
-    def _begun(self, start: Start, samples: int) -> Array:
-        """(R, T, C, s) derivatives by initial states that come with the world; zero where a state
-        is known.
+    def _begun(self, problem: Problem, start: Start, samples: int) -> Array:
+        """(R, T, C, s) derivatives by initial states, of the problem or those that come with the
+        world; zero where a state is known.
         """
         world = self.world
         # loaded where there is a robot alone
         from bench.gap.model.tangents import begun
 
-        derivatives = begun(world, start.theta, start.states)[:, :samples]
+        shared = problem.by_states
+        if shared is None:
+            shared = begun(world, start.theta, start.states)
+        derivatives = shared[:, :samples]
         kept: Array = derivatives * ~world.known[:, None, None, :]
         return kept
 

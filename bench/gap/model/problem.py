@@ -75,6 +75,12 @@ KEPT = 0.5
 """Derivatives serve for another step while ρ is no farther from 1."""
 
 
+SHARED_RENEWALS = 2
+"""Number of renewals of the derivatives after which a model near the data gets derivatives by its
+initial states of its own.
+"""
+
+
 class Known(NamedTuple):
     """Derivatives (R, T, C, q) of the runs by some of the parameters, (q,) of theta, about a point
     nearby.
@@ -169,6 +175,9 @@ class Problem:
         exact: whether it goes on until `EXACT`.
         rough: whether its cost is not smooth at the scale of the noise.
         samples: number of samples that count.
+        renewals: number of times that derivatives were taken anew.
+        by_states: (R, T, C, s) derivatives by initial states about this model; None for those that
+            all models share.
     """
 
     point: Point
@@ -187,6 +196,16 @@ class Problem:
     exact: bool = False
     rough: bool = False
     samples: int = 0
+    renewals: int = 0
+    by_states: Array | None = None
+
+    @property
+    def needs_own_states(self) -> bool:
+        """Whether derivatives by initial states that all models share do not serve this one: near
+        the data it has needed new ones for its parameters again and again.
+        """
+        slow = self.rough and self.by_states is None and self.renewals >= SHARED_RENEWALS
+        return slow and not self._is_far(self.point.cost)
 
     def enough(self, cost: float) -> float:
         """By less than this a step need not lower the cost."""

@@ -75,14 +75,25 @@ def begun(world: World, theta: Array, states: Array, anew: bool = False) -> Arra
         anew: take them about this model, and keep them.
     """
     if world.derivatives is None or anew:
-        runs, length, channels = world.observed.shape
-        result = np.zeros((runs, length, channels, len(world.states)))
-        calls = [(run, theta, states[run]) for run in range(runs)]
-        for run, values in world.crew.each(world, _begun, calls):
-            result[run, : values.shape[1]] = np.moveaxis(values, 0, -1)
-        result[~followed(result)] = 0.0
-        world.derivatives = result
+        world.derivatives = begun_about(world, theta, states)
     return world.derivatives
+
+
+def begun_about(world: World, theta: Array, states: Array) -> Array:
+    """Return the derivatives (R, T, C, s) of the runs by their initial states about one model.
+
+    Args:
+        world: the runs, of a robot.
+        theta: (P,) its parameters.
+        states: (R, s) its initial states.
+    """
+    runs, length, channels = world.observed.shape
+    result = np.zeros((runs, length, channels, len(world.states)))
+    calls = [(run, theta, states[run]) for run in range(runs)]
+    for run, values in world.crew.each(world, _begun, calls):
+        result[run, : values.shape[1]] = np.moveaxis(values, 0, -1)
+    result[~followed(result)] = 0.0
+    return result
 
 
 def _begun(world: World, run: int, theta: Array, states: Array) -> Array:

@@ -55,8 +55,10 @@ UNMEASURED_PRIOR, UNMEASURED_SPEED = 0.3, 3.0
 """The same of joints that are not recorded, rad or m, and per second."""
 FIRST_FORCE = 0.1
 """Missing force from which the fit of the process noise begins, as a share of a typical force."""
-RELINEARISED = 2
-"""Number of times the motion is smoothed and the model linearised about it again."""
+MAX_LINEARISATIONS = 4
+"""Maximum number of times the model is linearised about a motion that is smoothed with it."""
+LINEARISED_GAIN = 10.0
+"""Log likelihood that a linearisation must gain for another one."""
 
 CORRELATIONS = (0.4, 0.6, 0.75, 0.85, 0.92, 0.96)
 """Correlations of AR(1) sensor noise that are tried one after another while they gain."""
@@ -160,10 +162,9 @@ class FollowedRuns:
         assert isinstance(world.simulator, RobotSimulator)
         robot = world.simulator.robot
         typical = np.concatenate([scales(robot).force, floating_forces(robot)])
-        again = RELINEARISED if trajectories is None else 1
-        found: FollowedRuns | None = None
+        best: FollowedRuns | None = None
         linear: list[MeasuredLinear] = []
-        for _ in range(again):
+        for number in range(MAX_LINEARISATIONS if trajectories is None else 1):
             # Jacobians change little from one motion to another near the data.
             nearby: Sequence[MeasuredLinear | None] = linear or [None] * len(world.tracks)
             motion: Sequence[Trajectory | None] = trajectories or [None] * len(world.tracks)
@@ -177,10 +178,36 @@ class FollowedRuns:
             begin = FIRST_FORCE * typical if force is None else force
             fitted = _fit_noise(runs, noise, begin, typical)
             found = cls(world, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
-            force, noise = found.force, found.noise
-            trajectories = found.trajectories
-        assert found is not None
-        return found
+            force, noise, trajectories = found.force, found.noise, found.trajectories
+            gain = np.inf if best is None else found.log_likelihood - best.log_likelihood
+            # The first one is about the readings alone, which are not a motion.
+            best = found if number < 2 or gain > 0.0 else best
+            if not gain > LINEARISED_GAIN:
+                break
+        assert best is not None
+        return best
+
+    def with_parameters(
+        self, theta: Array, simulator: RobotSimulator | None = None, is_alike: bool = False
+    ) -> FollowedRuns:
+        """Return the filter of a model with other parameters, linearised once about this smoothed
+        motion, with process noise that begins from this one.
+
+        Args:
+            theta: (P,) the parameters.
+            simulator: in place of that of the world.
+            is_alike: whether these Jacobians are used again.
+        """
+        linear = [
+            _linearised(self.world, theta, self.noise, run, motion, near, simulator, is_alike)
+            for run, (motion, near) in enumerate(zip(self.trajectories, self.linear, strict=True))
+        ]
+        maps = [one.interval_maps() for one in linear]
+        # An effect may have states of its own.
+        prior = _prior(self.world, linear, maps[0].states.shape[1])
+        runs = LinearRuns.stacked(maps, self.world.observed, prior)
+        fitted = _fit_noise(runs, self.noise, self.force, self.typical)
+        return replace(self, theta=theta, linear=linear, runs=runs, **fitted._asdict())
 
     @classmethod
     def of_model(cls, world: World, theta: Array, noise: Noise) -> FollowedRuns:
@@ -482,6 +509,7 @@ def _linearised(
     trajectory: Trajectory | None,
     nearby: MeasuredLinear | None,
     simulator: RobotSimulator | None = None,
+    is_alike: bool = True,
 ) -> MeasuredLinear:
     """Linearise the model of one run about a motion; None stands for that of its readings alone."""
     half = len(world.states) // 2
@@ -492,7 +520,7 @@ def _linearised(
     if given is None:
         states = measured_states(world, noise.sigma, run)
         return MeasuredLinear(robot, theta, scenario, start, measured=states)
-    return MeasuredLinear(robot, theta, scenario, start, given, nearby=nearby)
+    return MeasuredLinear(robot, theta, scenario, start, given, None, nearby, is_alike)
 
 
 def _prior(world: World, linear: Sequence[MeasuredLinear], size: int) -> Array:

@@ -142,7 +142,24 @@ NEGLIGIBLE, NEGLIGIBLE_SHARE = 0.1, 0.005
 
 
 class SoftFrictionError(Exception):
-    """Dry friction of these data has MuJoCo's soft form: search with a simulator of that form."""
+    """Dry friction of these data has MuJoCo's soft form: search with a simulator of that form.
+
+    Attributes:
+        start: the model whose filter says so; None where simulation does.
+        is_preliminary: whether filters alone say so, before anything was fitted.
+    """
+
+    is_preliminary = False
+
+    def __init__(self, start: Start | None = None) -> None:
+        super().__init__()
+        self.start = start
+
+
+class PreliminarySoftFrictionError(SoftFrictionError):
+    """A filter with soft friction follows the runs better than one with what was selected."""
+
+    is_preliminary = True
 
 
 class _Trial(NamedTuple):
@@ -154,13 +171,23 @@ class _Trial(NamedTuple):
 
 @dataclass
 class PredictionErrorSearch(Search):
-    """A search whose candidates come from prediction errors."""
+    """A search whose candidates come from prediction errors.
 
+    Attributes:
+        is_form_given: whether the form of dry friction is not asked about before effects are
+            fitted.
+        likely: a model that is fitted before anything is selected, if there is one.
+    """
+
+    is_form_given: bool = False
+    likely: Start | None = None
     _selected: Selected | None = None
     _columns: Columns | None = None
     _hats: Columns | None = None
     _followed: dict[bytes, FollowedRuns] = field(default_factory=dict)
+    _followed_sets: dict[frozenset[str], FollowedRuns] = field(default_factory=dict)
     _regressions: dict[bytes, Regression] = field(default_factory=dict)
+    _likelihoods: dict[tuple[bytes, bool], float] = field(default_factory=dict)
     _trial_filters: dict[bytes, FollowedRuns] = field(default_factory=dict)
     _model_columns: dict[bytes, dict[str, list[int]]] = field(default_factory=dict)
 
@@ -172,11 +199,17 @@ class PredictionErrorSearch(Search):
         """
         watch = self.world.watch
         self.supported = self.base
+        if self.likely is not None:
+            best = self._without_idle_effects(self._fit(self.likely))
+            if self._is_explained(best):
+                self.supported = best
+                return best
         followed = self.follow()
         columns = self._library_columns()
         watch.stage("selecting effects", 1)
         selected = identify(followed, columns)
         self._selected = selected
+        self._compare_soft_friction(selected)
         friction = self._fit_dry_friction(selected)
         best = friction
         if not self._is_explained(best):
@@ -314,33 +347,50 @@ class PredictionErrorSearch(Search):
         plain = self._plain_friction(selected)
         return self._select_in_model(plain, self._friction_of(selected, plain))
 
+    def _compare_soft_friction(self, selected: Selected) -> None:
+        """Compare a selection with dry friction in MuJoCo's soft form, before anything is fitted.
+
+        Raises:
+            SoftFrictionError: that is likelier than the selection.
+        """
+        if self.is_form_given or not self._lacks_force(self.follow()):
+            return
+        kept = self._without_surplus(selected)
+        own = self._likelihood(self._start(kept.groups, kept.coefficients).theta)
+        likelihood, start = self._soft_friction
+        if likelihood > own + 0.5 * SWITCH:
+            raise PreliminarySoftFrictionError(start)
+
     def _check_soft_friction(self, best: _Trial) -> None:
         """Compare a trial with dry friction in MuJoCo's soft form.
 
         Raises:
             SoftFrictionError: that is likelier than the trial.
         """
-        if self._soft_friction_likelihood > best.followed.log_likelihood + 0.5 * SWITCH:
-            raise SoftFrictionError
+        likelihood, start = self._soft_friction
+        if likelihood > best.followed.log_likelihood + 0.5 * SWITCH:
+            raise SoftFrictionError(start)
 
     @cached_property
-    def _soft_friction_likelihood(self) -> float:
-        """Largest log likelihood with soft dry friction at the joint where most is missing; minus
-        infinity where there is none.
+    def _soft_friction(self) -> tuple[float, Start | None]:
+        """The largest log likelihood with soft dry friction at the joint where most is missing, and
+        the model; minus infinity where there is none.
         """
         world, followed = self.world, self.follow()
         joint = followed.joints_by_loss[0]
         name = f"friction.coulomb@{self._joint_name(joint)}"
         if self._is_soft or name not in world.library:
-            return -np.inf
-        found = []
+            return -np.inf, None
+        best: tuple[float, Start | None] = -np.inf, None
         for factor in SOFT_FACTORS:
-            start = self._reference.copy()
+            theta = self._reference.copy()
             # A joint that slides lacks about the force of its friction.
             size = np.array([factor * float(followed.force[joint])])
-            start[world.slots[name]] = self._within_bounds(name, size)
-            found.append(self._likelihood(start, self._soft_simulator))
-        return max(found)
+            theta[world.slots[name]] = self._within_bounds(name, size)
+            likelihood = self._likelihood(theta, self._soft_simulator)
+            if likelihood > best[0]:
+                best = likelihood, Start((name,), theta, self._first_states(followed))
+        return best
 
     def _plain_friction(self, selected: Selected) -> tuple[str, ...]:
         """The dry friction of a selection, without a state; a family in place of its members."""
@@ -370,7 +420,7 @@ class PredictionErrorSearch(Search):
         """Leave out the last effects of a selection that gain little when a filter has the set in
         the model: far from the base model a regression is wrong.
         """
-        own = self.follow().log_likelihood
+        own = self._likelihood(self._reference)
         best, kept, gained = 0.0, 0, 0.0
         found: list[Array] = []
         for count in range(1, len(selected.groups) + 1):
@@ -508,7 +558,7 @@ class PredictionErrorSearch(Search):
         """
         if not tried:
             return ()
-        gain = 2.0 * (tried[0].followed.log_likelihood - self.follow().log_likelihood)
+        gain = 2.0 * (tried[0].followed.log_likelihood - self._likelihood(self._reference))
         limit = self._criterion(tried[0]) + RIVAL_MARGIN + LINEARISATION_ERROR * gain
         near = [trial for trial in tried if self._criterion(trial) <= limit]
         return [*near, *tried[len(near) : MAX_FIRST_EFFECTS]]
@@ -540,8 +590,9 @@ class PredictionErrorSearch(Search):
 
     def _larger_that_pay(self, trial: _Trial) -> list[_Trial]:
         """Trials with one more effect whose likelihood pays for it, the likeliest first."""
-        own = trial.followed.log_likelihood
-        share = LEAST_SHARE * 2.0 * (own - self.follow().log_likelihood)
+        base = self._likelihood(self._reference)
+        own = trial.followed.log_likelihood if trial.names else base
+        share = LEAST_SHARE * 2.0 * (own - base)
         return [
             one
             for one in self._try_one_more(trial)
@@ -571,7 +622,7 @@ class PredictionErrorSearch(Search):
 
     def _is_settled(self, best: _Trial, other: _Trial) -> bool:
         """Whether a trial explains the runs, and another one is far behind."""
-        gain = 2.0 * (best.followed.log_likelihood - self.follow().log_likelihood)
+        gain = 2.0 * (best.followed.log_likelihood - self._likelihood(self._reference))
         behind = self._criterion(other) - self._criterion(best)
         far = behind > RIVAL_MARGIN + SETTLED_SHARE * gain
         return far and not self._lacks_force(best.followed)
@@ -730,14 +781,10 @@ class PredictionErrorSearch(Search):
         return best
 
     def _follow_near(self, theta: Array, known: FollowedRuns) -> FollowedRuns:
-        """Follow the runs with other parameters, the process noise being near one that is known."""
-        world, noise = self.world, self.follow().noise
-        followed = FollowedRuns.follow(world, theta, noise, None, force=known.force)
-        if not self._has_moved_far(followed):
-            return followed
+        """Follow the runs with other parameters, about a motion that is known."""
+        followed = known.with_parameters(theta)
         # With an encoder offset the true motion differs from the readings.
-        motion = followed.trajectories
-        return FollowedRuns.follow(world, theta, noise, motion, force=known.force)
+        return followed.with_parameters(theta) if self._has_moved_far(followed) else followed
 
     def _offset_from_command(self, joint: int) -> float:
         """Return the mean difference of a joint's readings from the command of its position servo;
@@ -827,9 +874,10 @@ class PredictionErrorSearch(Search):
         """Return the log likelihood of the innovations with these parameters of a simulator; None
         stands for that of the world.
         """
-        world, followed = self.world, self.follow()
-        own = FollowedRuns.follow(world, theta, followed.noise, None, simulator, followed.force)
-        return own.log_likelihood
+        key = theta.tobytes(), simulator is None
+        if key not in self._likelihoods:
+            self._likelihoods[key] = self.follow().with_parameters(theta, simulator).log_likelihood
+        return self._likelihoods[key]
 
     def _plain_theta(self, start: Start) -> Array:
         """The parameters of a start with dry friction in place of laws with a state."""
@@ -855,6 +903,13 @@ class PredictionErrorSearch(Search):
             kept = [i not in self.frozen for i in self.world.base.tolist()]
             theta[self.world.base[kept]] = identified[kept]
         return theta
+
+    def take_over(self, other: PredictionErrorSearch) -> None:
+        """Use the filter and the responses of a search of the same runs with the other form of dry
+        friction, whose base model has none.
+        """
+        self.world.followed = replace(other.follow(), world=self.world)
+        self._columns, self._hats = other._columns, other._hats
 
     def follow(self) -> FollowedRuns:
         """Return the runs as the filter follows them with the base model."""
@@ -1163,9 +1218,12 @@ class PredictionErrorSearch(Search):
             return followed
         key = self._key(model)
         if key not in self._followed:
-            found = FollowedRuns.follow(
-                self.world, model.fit.theta, followed.noise, None, force=followed.force
-            )
+            names = frozenset(model.names)
+            known = self._followed_sets.get(names)
+            found = (known or followed).with_parameters(model.fit.theta)
+            if known is None:
+                found = found.with_parameters(model.fit.theta, is_alike=True)
+            self._followed_sets[names] = found
             share = self._selected.numerics if self._selected is not None else 0.0
             if share:
                 defects = found.runs.defects - share * found.runs.step_errors
