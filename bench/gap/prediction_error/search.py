@@ -108,6 +108,10 @@ OFFSET_THRESHOLD = 10.0
 """A smoothed first position takes the place of the recorded one from so many times the noise."""
 RELINEARISATION_THRESHOLD = 100.0
 """The model is linearised again where the smoothed motion has moved by so many times the noise."""
+MAX_SURPLUS = 2
+"""Number of selected effects that may gain too little one after another before the rest of a
+selection is left out.
+"""
 MAX_SLOW_EFFECTS = 2
 """Sets of at most so many effects are fitted by simulation even where that is slow."""
 MAX_CACHED_FILTERS = 6
@@ -353,7 +357,7 @@ class PredictionErrorSearch(Search):
         Raises:
             SoftFrictionError: that is likelier than the selection.
         """
-        if self.is_form_given or not self._lacks_force(self.follow()):
+        if self._is_soft or self.is_form_given or not self._lacks_force(self.follow()):
             return
         kept = self._without_surplus(selected)
         own = self._likelihood(self._start(kept.groups, kept.coefficients).theta)
@@ -424,6 +428,8 @@ class PredictionErrorSearch(Search):
         best, kept, gained = 0.0, 0, 0.0
         found: list[Array] = []
         for count in range(1, len(selected.groups) + 1):
+            if count > kept + MAX_SURPLUS:
+                break
             groups = selected.groups[:count]
             coefficients = selected.regression.solve(groups)[1]
             gain = 2.0 * (self._likelihood(self._start(groups, coefficients).theta) - own)
