@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bench.commands.answer import DONE, WRONG, Answer, Document, Say
 from bench.commands.options import (
@@ -16,6 +17,11 @@ from bench.commands.options import (
     place,
     positive,
 )
+
+if TYPE_CHECKING:
+    from bench.gap.conventions.comparison import Difference
+    from sims.base import Simulator
+    from sims.recording.recording import Recording
 
 
 def add_simulate(simulate: argparse.ArgumentParser) -> None:
@@ -96,6 +102,13 @@ def add_inspect(inspect: argparse.ArgumentParser) -> None:
         metavar="A,B,...",
         help="with --check: constants, or numbers of a model file, that are to be estimated",
     )
+    inspect.add_argument(
+        "--fix",
+        metavar="NAME.toml",
+        type=place,
+        help="of a robot: write the description with the conventions that the model file means, "
+        "a new file",
+    )
     add_pdf(inspect)
     add_plugin(inspect, "systems")
     inspect.set_defaults(command=_inspect)
@@ -171,15 +184,22 @@ def _inspect(options: argparse.Namespace, say: Say) -> Answer:
     found = [*oddities(recording, kind), *unplaced(recording, kind)]
     odd = [*(o.text for o in found), *robotic.odd(recording, kind)]
     findings = list(census(recording, kind))
+    differences, fixes = _differing_conventions(options, recording, kind)
     for line in (
         *about,
         *summary(recording, kind),
         *(f"odd: {text}" for text in odd),
         *(f"finding: {finding.line}" for finding in findings),
+        *(f"convention: {one.description}" for one in differences),
+        *(f"    set {line}" for line in fixes),
     ):
         say(line)
     folder = options.out or Path("results/inspect", options.recording.resolve().parent.name)
     files = draw(recording, kind, folder)
+    if options.fix:
+        from bench.gap.conventions.corrected_description import write_corrected
+
+        files += write_corrected(options.recording, kind, differences, options.fix)
     for path in files:
         say(str(path))
     numbers = _checked(options, say) if options.check else None
@@ -188,11 +208,51 @@ def _inspect(options: argparse.Namespace, say: Say) -> Answer:
         "robot": about,
         "odd": odd,
         "findings": [finding._asdict() for finding in findings],
+        "conventions": [
+            {
+                "text": one.hypothesis.description,
+                "alternatives": [other.description for other in one.alternatives],
+            }
+            for one in differences
+        ],
+        "fixes": fixes,
         "check": numbers,
         "files": files,
     }
     lost = any(n["free"] and n["word"] == "not identifiable" for n in numbers or ())
     return Answer(document, WRONG if lost else DONE)
+
+
+def _differing_conventions(
+    options: argparse.Namespace, recording: Recording, kind: type[Simulator]
+) -> tuple[list[Difference], list[str]]:
+    """Return the conventions of a robot's log that differ from those of its model file, and the
+    keys of the description that correct them.
+
+    Raises:
+        InputError: a corrected description is asked for, and nothing differs.
+    """
+    from sims.base import InputError
+    from sims.simulated import Simulated
+
+    differences: list[Difference] = []
+    if issubclass(kind, Simulated) and kind.has_model:
+        from bench.gap.conventions.comparison import ConventionComparison
+        from bench.gap.unit_check import Subject
+
+        differences = ConventionComparison(Subject(kind, recording, None)).differences()
+    if options.fix and not differences:
+        raise InputError(
+            f"{options.recording}: expected conventions that differ from those of the model file, "
+            "found none; leave --fix out"
+        )
+    if not differences:
+        return [], []
+    from bench.gap.conventions.corrected_description import lines_of
+    from sims.recording.description import read_meta
+
+    _, meta = read_meta(options.recording)
+    return differences, list(lines_of(meta, kind, differences))
 
 
 def _checked(options: argparse.Namespace, say: Say) -> list[Document]:

@@ -57,6 +57,7 @@ from bench.runs.threads import one_thread
 from sims import extended as extend
 from sims.base import Array, InputError
 from sims.extended import Extended
+from sims.recording.description import read_meta
 from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 
@@ -243,6 +244,7 @@ class _Explainer:
             say(note)
         check_recording(self.recording, kind(engine=self.engine), force)
         self.watch = watch
+        self.force = force
         self.crew = crew
         self.thorough = thorough
         self.free = tuple(free)
@@ -344,6 +346,7 @@ class _Explainer:
     # Small products: with a thread for each core they take five times as long where others compute.
     @one_thread()
     def run(self) -> Explanation:
+        self._refuse_broken_conventions()
         self.watch.stage(STAGES["base_fit"])
         base = self._base()
         if not np.isfinite(base.fit.simulated[np.isfinite(self.fitting.observed)]).all():
@@ -394,6 +397,36 @@ class _Explainer:
             return _Found(base, again, self._finding(again), rng)
         except SoftFrictionError as error:
             return self._searched_soft(base, search, error.start)
+
+    def _refuse_broken_conventions(self) -> None:
+        """Refuse a robot's recording whose conventions differ from those of its model file.
+
+        Raises:
+            InputError: they do; the message says what to change.
+        """
+        if not self.kind.has_model or self.force:
+            return
+        # Loaded where there is a robot alone.
+        from bench.gap.conventions.comparison import ConventionComparison
+        from bench.gap.conventions.corrected_description import lines_of
+
+        self.watch.stage("comparing conventions of log and model")
+        differences = ConventionComparison(self._units).differences()
+        if not differences:
+            return
+        remedy = "correct these signals"
+        if self.recording.path.with_suffix(".toml").exists():
+            _, meta = read_meta(self.recording.path)
+            lines = "; ".join(lines_of(meta, self.kind, differences))
+            remedy = (
+                f"set {lines} in {self._units.file}, or write a corrected description: "
+                f"simgap inspect {self.path.name} --fix NAME.toml"
+            )
+        what = "; ".join(one.description for one in differences)
+        raise InputError(
+            f"{self.path}: {what}; expected the conventions of the model file: {remedy} "
+            "(--force explains the log as it is)"
+        )
 
     @staticmethod
     def _is_explained(found: _Found) -> bool:

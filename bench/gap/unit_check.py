@@ -106,7 +106,7 @@ _TOGETHER = (
     {"m": "cm", "m/s": "cm/s"},
 )
 """Units that a whole log is in, by SI unit."""
-_WORDS = {
+UNITS_IN_WORDS = {
     "deg": "degrees",
     "deg/s": "degrees per second",
     "rad": "radians",
@@ -201,7 +201,7 @@ class Hypothesis:
         if unit == first.stated:
             return f"The recorded numbers of {names} look converted twice: {scale}"
         turned = f"; the sign is reversed too: {scale}" if self.scale < 0 else ""
-        words, stated = _WORDS.get(unit, unit), _WORDS.get(first.stated, first.stated)
+        words, stated = (UNITS_IN_WORDS.get(one, one) for one in (unit, first.stated))
         wanted = dict.fromkeys(f'unit = "{one}"' for one in self.units)
         return (
             f"The recorded numbers of {names} look like {words}, stated as {stated} "

@@ -148,6 +148,7 @@ class FollowedRuns:
         trajectories: Sequence[Trajectory] | None,
         simulator: RobotSimulator | None = None,
         force: Array | None = None,
+        max_linearisations: int = MAX_LINEARISATIONS,
     ) -> FollowedRuns:
         """Linearise a model about the measured motion and filter the runs.
 
@@ -158,13 +159,14 @@ class FollowedRuns:
             trajectories: the motion of each run, if it has been estimated before.
             simulator: in place of that of the world.
             force: (E,) missing forces with which the fit of the process noise begins.
+            max_linearisations: maximum number of them, where the motion is not given.
         """
         assert isinstance(world.simulator, RobotSimulator)
         robot = world.simulator.robot
         typical = np.concatenate([scales(robot).force, floating_forces(robot)])
         best: FollowedRuns | None = None
         linear: list[MeasuredLinear] = []
-        for number in range(MAX_LINEARISATIONS if trajectories is None else 1):
+        for number in range(max_linearisations if trajectories is None else 1):
             # Jacobians change little from one motion to another near the data.
             nearby: Sequence[MeasuredLinear | None] = linear or [None] * len(world.tracks)
             motion: Sequence[Trajectory | None] = trajectories or [None] * len(world.tracks)

@@ -1,0 +1,331 @@
+"""Compare conventions of a robot's log by the model's own prediction errors.
+
+A Kalman filter with the model follows the log under each hypothesis
+(`bench.gap.prediction_error.state_estimation`). Hypotheses are compared by the likelihood of the
+recorded numbers y,
+
+    log L(y | hypothesis) = log L(transformed y) + Σ_c N_c log |k_c|                             (1)
+
+with k_c the factor of channel c and N_c its number of samples. A convention differs where (1) is
+clearly larger than for the log as it is described, and larger than with the best set of causes that
+prediction-error identification selects (`bench.gap.prediction_error.identification`): friction,
+delays and small offsets are causes, not conventions.
+
+Hypotheses are compared on a short part of some runs; the chosen ones are confirmed on all samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from bench.gap.causes.candidates import Probe, first_probes
+from bench.gap.causes.gains import Group
+from bench.gap.causes.structure import probes as force_probes
+from bench.gap.conventions.hypotheses import (
+    MAX_NAMED,
+    MIN_OFFSET,
+    Hypothesis,
+    HypothesisGenerator,
+    Joint,
+)
+from bench.gap.identify import listed
+from bench.gap.model.bounds import coefficient_bounds
+from bench.gap.model.floor import noise_floor
+from bench.gap.model.noise import Noise
+from bench.gap.model.problem import Fit
+from bench.gap.model.world import World
+from bench.gap.prediction_error.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
+from bench.gap.prediction_error.identification import identify
+from bench.gap.prediction_error.search import MANY_SHAPES
+from bench.gap.unit_check import Subject
+from sims.base import Array
+from sims.recording.recording import Recording, Run
+
+LOG_LIKELIHOOD_MARGIN = 20.0
+"""Log likelihood by which a hypothesis must exceed the log as it is described."""
+CAUSES_MARGIN = 10.0
+"""Log likelihood by which it must exceed the best set of causes."""
+EQUAL_LOG_LIKELIHOOD = 3.0
+"""Difference of log likelihoods below which two hypotheses explain a log equally well."""
+MIN_MISSING_FORCE, LARGE_MISSING_FORCE = 0.1, 0.3
+"""Largest missing force of a joint, as a share of its typical force: below the first no convention
+is questioned, and below the second those of this joint alone.
+"""
+SUSPECT_SHARE = 0.1
+"""Missing force of a joint, as a share of its typical force and of the largest such share, from
+which its conventions are questioned.
+"""
+PART_SAMPLES = 60
+"""Number of samples of the part of a run on which hypotheses are compared."""
+PART_RUNS = 3
+"""Number of runs of which parts are used."""
+MAX_REFINED = 4
+"""Maximum number of hypotheses whose offsets are refined."""
+MAX_DIFFERENCES = 3
+"""Maximum number of conventions that are sought one after another."""
+MIN_REFINEMENT_GAIN = 0.1
+"""Log likelihood that a step of the refinement must gain."""
+FIRST_OFFSET_STEP = 0.3
+"""First step of the refinement of an offset, rad."""
+OFFSET_ACCURACY = 1e-3
+"""Accuracy of an offset, rad."""
+GAIN_EFFECTS = frozenset({"input.gain", "sensor.gain"})
+"""Effects that contain reversed signs and wrong units, and so do not compete with them."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A convention of the log that differs from that of the model file.
+
+    Attributes:
+        hypothesis: what differs.
+        gain: log likelihood that it gains on the short parts.
+        alternatives: hypotheses that explain the log equally well.
+    """
+
+    hypothesis: Hypothesis
+    gain: float
+    alternatives: tuple[Hypothesis, ...] = ()
+
+    @property
+    def description(self) -> str:
+        """What differs, with what would explain the log equally well."""
+        if not self.alternatives:
+            return self.hypothesis.description
+        others = listed([one.description for one in self.alternatives], MAX_NAMED)
+        return f"{self.hypothesis.description} (or {others})"
+
+
+class ConventionComparison:
+    """Compare conventions of a robot's log with those of its model file.
+
+    Args:
+        subject: the recording of a robot.
+
+    Attributes:
+        subject: as given.
+        evaluations: number of hypotheses that a filter has followed.
+    """
+
+    def __init__(self, subject: Subject) -> None:
+        self.subject = subject
+        self.evaluations = 0
+        self._generator = HypothesisGenerator(subject)
+
+    def differences(self) -> list[Difference]:
+        """Return the conventions that differ, the most certain first; an empty list if none do."""
+        described = corrected = self.subject.recording
+        differences: list[Difference] = []
+        for _ in range(MAX_DIFFERENCES):
+            suspects = self._suspects(self._follow(self._parts(corrected)))
+            best = self._best_hypothesis(corrected, suspects) if suspects else None
+            if best is None:
+                break
+            differences.append(best)
+            corrected = best.hypothesis.applied(corrected)
+        gain = sum(one.gain for one in differences)
+        if not differences or gain < self._gain_of_causes(corrected) + CAUSES_MARGIN:
+            return []
+        before, after = (_log_likelihood(self._follow(one)) for one in (described, corrected))
+        return differences if after > before + LOG_LIKELIHOOD_MARGIN else []
+
+    def _suspects(self, followed: FollowedRuns) -> list[Joint]:
+        """Return the joints at which a large force is missing; all where the filter diverges."""
+        if not followed.is_sound:
+            return self._generator.joints
+        coordinates = self.subject.kind.system.coordinates
+        shares = (followed.force / followed.typical)[: len(coordinates)]
+        if not followed.missing_forces.any() or shares.max() <= MIN_MISSING_FORCE:
+            return []
+        limit = SUSPECT_SHARE * max(1.0, float(shares.max()))
+        if shares.max() < LARGE_MISSING_FORCE:
+            limit = float(np.nextafter(shares.max(), 0.0))
+        share_of = dict(zip(coordinates, shares.tolist(), strict=True))
+        return [j for j in self._generator.joints if share_of[f"q.{j.name}"] > limit]
+
+    def _best_hypothesis(
+        self, recording: Recording, suspects: Sequence[Joint]
+    ) -> Difference | None:
+        """Return the hypothesis with the largest likelihood; None where none is clearly ahead."""
+        limit = self._evaluate(Hypothesis(""), recording) + LOG_LIKELIHOOD_MARGIN
+        scored: dict[str, tuple[float, Hypothesis]] = {}
+        evaluated: list[object] = []
+        for hypothesis in self._generator.generate(recording, suspects):
+            key = dict(hypothesis.changes), hypothesis.late
+            if key in evaluated:
+                continue
+            evaluated.append(key)
+            score = self._evaluate(hypothesis, recording)
+            # Of several offsets of one signal the best one is refined.
+            known = scored.get(hypothesis.description, (limit, hypothesis))
+            if score > known[0]:
+                scored[hypothesis.description] = score, hypothesis
+        ahead = sorted(scored.values(), key=lambda pair: -pair[0])
+        refined = [self._refine(*pair, recording) for pair in ahead[:MAX_REFINED]]
+        clear = [pair for pair in (*refined, *ahead[MAX_REFINED:]) if pair[0] > limit]
+        if not clear:
+            return None
+        best = max(score for score, _ in clear)
+        equal = [one for score, one in clear if score > best - EQUAL_LOG_LIKELIHOOD]
+        first, *others = sorted(equal, key=lambda one: one.size)
+        gain = best - limit + LOG_LIKELIHOOD_MARGIN
+        return Difference(first, gain, tuple(others[: MAX_NAMED - 1]))
+
+    def _refine(
+        self, score: float, hypothesis: Hypothesis, recording: Recording
+    ) -> tuple[float, Hypothesis]:
+        """Improve the offset of a hypothesis by a pattern search (R. Hooke, T. A. Jeeves, J. ACM
+        8(2), 212, 1961, doi:10.1145/321062.321069).
+        """
+        changes = hypothesis.changes.values()
+        if hypothesis.unit is not None or not any(change.offset for change in changes):
+            return score, hypothesis
+        step = FIRST_OFFSET_STEP
+        while step > OFFSET_ACCURACY:
+            for signed in (step, -step):
+                moved = hypothesis.shifted(signed)
+                moved_score = self._evaluate(moved, recording)
+                if moved_score > score + MIN_REFINEMENT_GAIN:
+                    score, hypothesis = moved_score, moved
+                    break
+            else:
+                step /= 2.0
+        offset = max(abs(change.offset) for change in hypothesis.changes.values())
+        return (score if offset > MIN_OFFSET else -np.inf), hypothesis
+
+    def _evaluate(self, hypothesis: Hypothesis, recording: Recording) -> float:
+        """Return the log likelihood (1) on the short parts of a recording."""
+        self.evaluations += 1
+        parts = self._parts(hypothesis.applied(recording))
+        result = _log_likelihood(self._follow(parts, max_linearisations=1))
+        for name, change in hypothesis.changes.items():
+            if name in parts.runs[0].channels:
+                count = sum(int(np.isfinite(run.channels[name]).sum()) for run in parts.runs)
+                result += count * math.log(abs(change.scale))
+        return result
+
+    def _follow(
+        self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
+    ) -> FollowedRuns:
+        """Follow the training runs of a recording by a filter with the model file's numbers."""
+        world = self.subject.world(recording)
+        followed = FollowedRuns.follow(
+            world,
+            world.nominal(),
+            _white_noise(world, recording),
+            None,
+            max_linearisations=max_linearisations,
+        )
+        world.close()
+        return followed
+
+    def _gain_of_causes(self, corrected: Recording) -> float:
+        """Return the penalised log likelihood that the best set of causes gains on short parts.
+
+        Each effect is charged half the logarithm of the number of samples for each coefficient
+        (BIC), and the logarithm of the number of effects. Where much is missing, regression is
+        inaccurate, so filters with the effects in the model decide; where the corrected log is not
+        explained either, the larger of both counts.
+
+        Args:
+            corrected: the recording with its conventions corrected.
+        """
+        subject = self.subject
+        parts = self._parts(subject.recording)
+        world = World(
+            subject.kind, parts, parts.training(), subject.engine, force_probes(subject.kind)
+        )
+        followed = FollowedRuns.follow(world, world.nominal(), _white_noise(world, parts), None)
+        if not followed.is_sound:
+            world.close()
+            return 0.0
+        left_out = MANY_SHAPES | GAIN_EFFECTS
+        names = [name for name in world.library if name.partition("@")[0] not in left_out]
+        base = _unfitted(world)
+        probes = [probe for name in names for probe in first_probes(world, base, name)]
+        selected = identify(followed, followed.columns(probes))
+        before = followed.with_parameters(world.nominal()).log_likelihood
+        samples = int(followed.runs.recorded.sum())
+        gain, penalty = 0.0, 0.0
+        for count, group in enumerate(selected.groups, start=1):
+            penalty += 0.5 * len(group.columns) * math.log(samples) + math.log(len(names))
+            groups = selected.groups[:count]
+            theta = world.nominal()
+            for one, numbers in zip(groups, selected.regression.solve(groups)[1], strict=True):
+                theta[world.slots[one.effect]] = _coefficients(world, probes, one, numbers)
+            after = followed.with_parameters(theta).log_likelihood
+            gain = max(gain, after - before - penalty)
+        world.close()
+        if not self._suspects(self._follow(self._parts(corrected))):
+            return gain
+        return max(gain, selected.log_likelihood - followed.log_likelihood - penalty)
+
+    def _parts(self, recording: Recording) -> Recording:
+        """Return the parts of some training runs in which most moves."""
+        runs = recording.training()[:PART_RUNS]
+        parts = [run.part(part) for run, part in zip(runs, self._slices, strict=True)]
+        return replace(recording, runs=tuple(parts))
+
+    @cached_property
+    def _slices(self) -> list[slice]:
+        """Samples of these parts."""
+        return [_liveliest_part(run) for run in self.subject.recording.training()[:PART_RUNS]]
+
+
+def _log_likelihood(followed: FollowedRuns) -> float:
+    """Return the log likelihood of the innovations; minus infinity where the filter diverges."""
+    likelihood = followed.log_likelihood
+    return likelihood if np.isfinite(likelihood) and followed.is_sound else -np.inf
+
+
+def _white_noise(world: World, recording: Recording) -> Noise:
+    sigma = noise_floor(world, recording).sigma
+    return Noise(sigma, np.zeros(len(sigma)))
+
+
+def _unfitted(world: World) -> Fit:
+    """Return the model file's numbers as a fit, from which probes of effects begin."""
+    empty = np.zeros(0)
+    return Fit((), world.nominal(), world.guess, np.zeros(0, np.intp), empty, empty, 0.0)
+
+
+def _coefficients(world: World, probes: Sequence[Probe], group: Group, numbers: Array) -> Array:
+    """Return the coefficients of an effect, within their bounds.
+
+    Args:
+        world: the runs.
+        probes: of all effects.
+        group: columns of the effect.
+        numbers: coefficients of these columns.
+    """
+    c = probes[group.columns[0]].c.copy()
+    for column, value in zip(group.columns, numbers, strict=True):
+        if not probes[column].fixed:
+            c[probes[column].place] = value
+    lower, upper = np.array(coefficient_bounds(world, group.effect)).T
+    limited: Array = np.clip(c, lower, upper)
+    return limited
+
+
+def _liveliest_part(run: Run) -> slice:
+    """Return the part of a run in which its channels move most."""
+    count = run.times.size
+    if count <= PART_SAMPLES:
+        return slice(0, count)
+
+    def movement(begin: int) -> float:
+        total = 0.0
+        for values in run.channels.values():
+            part = values[begin : begin + PART_SAMPLES]
+            if np.isfinite(part).any():
+                total += float(np.nanstd(part)) / max(float(np.nanstd(values)), 1e-12)
+        return total
+
+    begins = range(0, count - PART_SAMPLES + 1, PART_SAMPLES // 2)
+    best = max(begins, key=movement)
+    return slice(best, best + PART_SAMPLES)

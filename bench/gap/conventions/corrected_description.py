@@ -1,0 +1,164 @@
+"""The description of a recording with conventions corrected: the keys to change, and a file."""
+
+from __future__ import annotations
+
+import copy
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.gap.conventions.comparison import Difference
+from bench.gap.conventions.hypotheses import Change, Hypothesis
+from sims.base import InputError
+from sims.recording.description import Declared, dotted, read_meta
+from sims.recording.units import scale
+
+KINDS = ("channels", "inputs")
+"""Tables of the description that state signals."""
+SHOWN = ("column", "unit", "scale", "offset", "unwrap")
+"""Keys of a signal that a correction changes, in the order in which they are shown."""
+
+
+def corrected(
+    meta: Mapping[str, Any], declared: Declared, differences: Sequence[Difference]
+) -> dict[str, Any]:
+    """Return the content of a description with conventions corrected one after another.
+
+    Args:
+        meta: the content of the description.
+        declared: the robot's simulator, which has the units of its signals.
+        differences: what differs.
+    """
+    result = copy.deepcopy(dict(meta))
+    units = {
+        "channels": {c.name: c.unit for c in declared.channels},
+        "inputs": {c.name: c.unit for c in declared.inputs},
+    }
+    for kind in KINDS:
+        result[kind] = dotted(result.get(kind, {}), units[kind])
+    for one in differences:
+        hypothesis = one.hypothesis
+        for kind in KINDS:
+            before = copy.deepcopy(result[kind])
+            for name, change in hypothesis.changes.items():
+                if name in before:
+                    own = _moved(before[change.source], name, change)
+                    result[kind][name] = _changed(own, units[kind][name], change, hypothesis)
+        if hypothesis.late:
+            time = dict(result.get("time", {}))
+            time["offset"] = _rounded(float(time.get("offset", 0.0)) - hypothesis.late)
+            result["time"] = time
+    return result
+
+
+def _moved(table: Mapping[str, Any], name: str, change: Change) -> dict[str, Any]:
+    """The table of a signal that stands in the column of another one."""
+    own = dict(table)
+    if change.source != name:
+        own.setdefault("column", change.source)
+        if own["column"] == name:
+            del own["column"]
+    return own
+
+
+def _changed(
+    table: dict[str, Any], si: str, change: Change, hypothesis: Hypothesis
+) -> dict[str, Any]:
+    """A signal's table with another unit, scale or offset.
+
+    With g the gain of the stated unit, recorded numbers r are g (k r + b) in SI; the change makes
+    c (g (k r + b)) + d of it, with d in SI units.
+    """
+    gain = scale(table["unit"], si).gain
+    factor, offset = change.scale, change.offset
+    named = hypothesis.unit is not None and hypothesis.unit not in ("ticks", "normalised")
+    if named:
+        # The change is that of the unit alone.
+        table["unit"] = hypothesis.unit
+        return table
+    k, b = float(table.get("scale", 1.0)), float(table.get("offset", 0.0))
+    if factor != 1.0:
+        table["scale"] = _rounded(factor * k)
+    if offset or b:
+        table["offset"] = _rounded(factor * b + offset / gain)
+    if change.unwrap:
+        table["unwrap"] = change.near or True
+    return table
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.9g}")
+
+
+def lines_of(
+    meta: Mapping[str, Any], declared: Declared, differences: Sequence[Difference]
+) -> Iterator[str]:
+    """Yield the tables of the signals that a correction changes, each in one line."""
+    after, before = corrected(meta, declared, differences), corrected(meta, declared, ())
+    for kind in KINDS:
+        names = [
+            name for one in differences for name in one.hypothesis.changes if name in after[kind]
+        ]
+        for name in dict.fromkeys(names):
+            table = after[kind][name]
+            was = before[kind][name]
+            own = [key for key in SHOWN if key in table and table[key] != was.get(key)]
+            keys = [f"{key} = {_shown(table[key])}" for key in own]
+            shown = f'"{name}"' if "." in name else name
+            yield f"[{kind}.{shown}] {', '.join(keys)}"
+    if any(one.hypothesis.late for one in differences):
+        yield f"[time] offset = {after['time']['offset']:.9g}"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else f"{value:.9g}"
+
+
+def write_corrected(
+    recording: Path, declared: Declared, differences: Sequence[Difference], path: Path
+) -> list[Path]:
+    """Write the corrected description, and beside it the table under the same name where the
+    description has none of its own.
+
+    Args:
+        recording: the recording's table or description.
+        declared: the robot's simulator.
+        differences: what differs.
+        path: ``NAME.toml``, a new file.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        InputError: a file exists already, or the path does not end in ``.toml``.
+    """
+    import tomli_w
+
+    if path.suffix != ".toml":
+        raise InputError(f"{path}: expected NAME.toml for the corrected description")
+    description, meta = read_meta(recording)
+    content = corrected(meta, declared, differences)
+    if "model" in content:
+        model = (description.parent / content["model"]).resolve()
+        content["model"] = os.path.relpath(model, path.parent.resolve())
+    table = description.with_suffix(".csv")
+    files = [(path, tomli_w.dumps(content))]
+    written = [path]
+    if table.exists():
+        written.append(path.with_suffix(".csv"))
+    elif path.parent.resolve() != description.parent.resolve():
+        where = f"expected a file in {description.parent}, where the log's files are"
+        raise InputError(f"{path}: {where}")
+    for file in written:
+        if file.exists():
+            raise InputError(f"{file}: exists already; nothing is overwritten, name another file")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for file, text in files:
+        file.write_text(text, encoding="utf-8")
+    if table.exists():
+        shutil.copyfile(table, path.with_suffix(".csv"))
+    return written

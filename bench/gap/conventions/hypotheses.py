@@ -1,0 +1,424 @@
+"""Hypotheses on how the conventions of a robot's log differ from those of its model file.
+
+Each hypothesis transforms the recorded signals into those that the model means: by a sign, another
+zero, another unit, the place of another joint, whole turns that were left out, or commands that
+were stamped late.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from bench.gap.identify import listed
+from bench.gap.unit_check import UNITS, UNITS_IN_WORDS, Signal, Subject
+from sims.base import Array
+from sims.recording.recording import Recording, Run
+
+ANGLES = np.array([-120.0, -70.0, -35.0, -15.0, 15.0, 35.0, 70.0, 120.0, 180.0]) * math.pi / 180.0
+"""Offsets of a zero position that are tried, rad; the best one is refined."""
+MIN_OFFSET = 0.1
+"""Smallest offset of a zero position that counts as a convention, rad. Smaller offsets are errors
+of calibration and assembly, which are causes.
+"""
+LATE_SAMPLES = (1, 2, 3, 4, 5, 6, 8)
+"""Numbers of samples by which commands may be stamped late."""
+TICKS_PER_TURN = (4096.0, 4095.0, 8192.0, 16384.0, 65536.0, 1024.0, 1023.0)
+"""Usual resolutions of encoders."""
+NORMALISED_RANGE = 100.0
+"""Upper end of positions that are normalised to the range of a joint."""
+WRAP_JUMP = 1.5 * math.pi
+"""Difference of successive positions that shows a wrapped position, rad."""
+MAX_NAMED = 4
+"""Maximum number of signals that a sentence names."""
+QUANTITIES = ("q", "qd", "tau")
+"""Prefixes of the channels of a joint: position, velocity, torque."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A signal of the model as a function of a recorded signal, in SI units.
+
+    Attributes:
+        source: name of the recorded signal.
+        scale: factor.
+        offset: added after the factor.
+        unwrap: whether whole turns are restored first.
+        near: name of the command that tells which turn a position is in; empty without one.
+    """
+
+    source: str
+    scale: float = 1.0
+    offset: float = 0.0
+    unwrap: bool = False
+    near: str = ""
+
+    def applied(self, signals: Mapping[str, Array]) -> Array:
+        """Return the signal (T,) that the model means.
+
+        Args:
+            signals: recorded signals by name, each (T,).
+        """
+        values = signals[self.source]
+        if self.unwrap:
+            values = unwrapped(values, signals.get(self.near))
+        return self.scale * values + self.offset
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A convention that may differ.
+
+    Attributes:
+        description: a sentence without its end.
+        changes: the signals that differ, by the name that the model has for them.
+        unit: unit of the recorded numbers, where it differs from the stated one.
+        late: time by which commands are stamped late, s.
+    """
+
+    description: str
+    changes: Mapping[str, Change] = field(default_factory=dict)
+    unit: str | None = None
+    late: float = 0.0
+
+    @property
+    def size(self) -> int:
+        """Number of signals that differ."""
+        return len(self.changes) + (self.late != 0.0)
+
+    def applied(self, recording: Recording) -> Recording:
+        """Return the recording with the signals that the model means."""
+        noise = dict(recording.noise)
+        for name, change in self.changes.items():
+            if change.source in recording.noise:
+                noise[name] = abs(change.scale) * recording.noise[change.source]
+        return replace(recording, noise=noise, runs=tuple(map(self._applied_to, recording.runs)))
+
+    def _applied_to(self, run: Run) -> Run:
+        signals = {**run.inputs, **run.channels}
+        earlier = {name: values[1] for name, values in run.before.items()}
+
+        def changed(values: Mapping[str, Array], source: Mapping[str, Array]) -> dict[str, Array]:
+            return {
+                name: self.changes[name].applied(source) if name in self.changes else old
+                for name, old in values.items()
+            }
+
+        before = {
+            name: np.stack([run.before[name][0], values])
+            for name, values in changed(earlier, earlier).items()
+        }
+        return replace(
+            run,
+            channels=changed(run.channels, signals),
+            inputs=changed(run.inputs, signals),
+            before=before,
+            initial={} if self.changes else run.initial,
+            offset=run.offset - self.late,
+        )
+
+    def shifted(self, step: float) -> Hypothesis:
+        """Return the hypothesis with its offsets changed by a step, rad."""
+        changes = {
+            name: replace(change, offset=change.offset + step)
+            for name, change in self.changes.items()
+        }
+        return replace(self, changes=changes)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint and its recorded signals.
+
+    Attributes:
+        name: of the joint.
+        channels: names of recorded channels by quantity: ``q``, ``qd``, ``tau``.
+        inputs: names of the inputs of its actuators.
+        servo_inputs: names of the inputs of its position servos.
+        range: limits of its position, rad or m; None where the model states none.
+        is_hinge: whether it turns.
+    """
+
+    name: str
+    channels: Mapping[str, str]
+    inputs: tuple[str, ...]
+    servo_inputs: tuple[str, ...]
+    range: tuple[float, float] | None
+    is_hinge: bool
+
+
+def unwrapped(positions: Array, command: Array | None = None) -> Array:
+    """Restore the whole turns of a wrapped position; NaN stays.
+
+    Args:
+        positions: (T,) in rad.
+        command: (T,) of the joint's position servo, which tells the turn.
+    """
+    result = positions.copy()
+    finite = np.isfinite(positions)
+    result[finite] = np.unwrap(positions[finite])
+    if command is not None and finite.any():
+        difference = float(np.mean((command - result)[finite]))
+        result += 2.0 * math.pi * round(difference / (2.0 * math.pi))
+    return result
+
+
+def recorded_joints(subject: Subject) -> list[Joint]:
+    """Return the joints of a robot, in the order of its coordinates, with their signals."""
+    kind: Any = subject.kind
+    run = subject.recording.runs[0]
+    units = {channel.name: channel.unit for channel in kind.channels}
+    joints = []
+    for coordinate in kind.system.coordinates:
+        name = coordinate.removeprefix("q.")
+        actuators = [a for a in kind.robot.actuators if a.joint == name]
+        recorded = [a for a in actuators if f"u.{a.name}" in run.inputs]
+        joints.append(
+            Joint(
+                name=name,
+                channels={q: f"{q}.{name}" for q in QUANTITIES if f"{q}.{name}" in run.channels},
+                inputs=tuple(f"u.{a.name}" for a in recorded),
+                servo_inputs=tuple(f"u.{a.name}" for a in recorded if a.kind == "position"),
+                range=getattr(kind.robot.joint(name), "range", None),
+                is_hinge=units.get(coordinate) == "rad",
+            )
+        )
+    return joints
+
+
+class HypothesisGenerator:
+    """Generate hypotheses on the conventions of a recording.
+
+    Args:
+        subject: the recording of a robot.
+    """
+
+    def __init__(self, subject: Subject) -> None:
+        channels = list(subject.recording.runs[0].channels)
+        self.joints = [joint for joint in recorded_joints(subject) if joint.channels]
+        self._signals = {signal.name: signal for signal in subject.signals(channels)}
+
+    def generate(self, recording: Recording, suspects: Sequence[Joint]) -> Iterator[Hypothesis]:
+        """Yield hypotheses.
+
+        Args:
+            recording: as it is read, or with some conventions corrected.
+            suspects: joints whose own conventions are questioned. Conventions of the whole log are
+                questioned where at least half of the joints are suspects.
+        """
+        suspects = [joint for joint in suspects if joint.channels]
+        for joint in suspects:
+            yield from _signs(joint)
+            yield from _zeros(joint, recording)
+            for name in dict.fromkeys((*joint.channels.values(), *joint.inputs)):
+                yield from _units([self._signals[name]], recording)
+        yield from _wraps(suspects, recording)
+        yield from _orders(self.joints, recording, suspects)
+        if 2 * len(suspects) >= len(self.joints):
+            yield from self._units_of_log(recording)
+            yield from self._normalised()
+        yield from _late_commands(recording)
+
+    def _units_of_log(self, recording: Recording) -> Iterator[Hypothesis]:
+        """Yield units that all signals of a kind may have."""
+        positions = self._channels("q")
+        commands = [name for joint in self.joints for name in joint.servo_inputs]
+        groups = positions, commands, [*positions, *commands], self._channels("qd")
+        for names in (*groups, self._channels("tau")):
+            signals = [self._signals[name] for name in names]
+            if len({(s.si, s.stated, s.gain) for s in signals}) == 1:
+                yield from _units(signals, recording)
+
+    def _channels(self, quantity: str) -> list[str]:
+        return [joint.channels[quantity] for joint in self.joints if quantity in joint.channels]
+
+    def _normalised(self) -> Iterator[Hypothesis]:
+        """Yield positions and commands that are normalised to the range of each joint."""
+        limited = [joint for joint in self.joints if joint.range and "q" in joint.channels]
+        if not limited:
+            return
+        for low in (-NORMALISED_RANGE, 0.0):
+            changes: dict[str, Change] = {}
+            for joint in limited:
+                assert joint.range is not None
+                lower, upper = joint.range
+                scale = (upper - lower) / (NORMALISED_RANGE - low)
+                for name in (joint.channels["q"], *joint.servo_inputs):
+                    gain = self._signals[name].gain
+                    changes[name] = Change(name, scale / gain, lower - low * scale)
+            yield Hypothesis(
+                f"positions and commands look normalised to {low:g} to {NORMALISED_RANGE:g} over "
+                "the range of each joint",
+                changes,
+                unit="normalised",
+            )
+
+
+def _signs(joint: Joint) -> Iterator[Hypothesis]:
+    """Yield reversed signs: of position, command, both, velocity alone, torque alone."""
+    positions = [joint.channels[q] for q in ("q", "qd") if q in joint.channels]
+    groups = [positions, list(joint.inputs)]
+    if len(joint.channels) > 1:
+        groups += [[joint.channels[q]] for q in ("qd", "tau") if q in joint.channels]
+    for names in groups:
+        if names:
+            text = f"the sign of {listed(names, MAX_NAMED)} looks reversed"
+            yield Hypothesis(text, {name: Change(name, -1.0) for name in names})
+    if positions and joint.inputs:
+        names = [*joint.channels.values(), *joint.inputs]
+        text = f"joint {joint.name} looks counted the other way round, command and position"
+        yield Hypothesis(text, {name: Change(name, -1.0) for name in names})
+
+
+def _zeros(joint: Joint, recording: Recording) -> Iterator[Hypothesis]:
+    """Yield other zero positions: of the encoder, and of encoder and command."""
+    position = joint.channels.get("q")
+    if position is None or not joint.is_hinge:
+        return
+    offsets = ANGLES.tolist()
+    if joint.servo_inputs:
+        command = joint.servo_inputs[0]
+        runs = recording.training()
+        differences = [run.inputs[command] - run.channels[position] for run in runs]
+        offsets = [float(np.mean([np.nanmean(values) for values in differences]))]
+        text = f"joint {joint.name} looks counted from another zero, command and position"
+        for offset in ANGLES.tolist():
+            names = (position, *joint.servo_inputs)
+            yield Hypothesis(text, {name: Change(name, 1.0, offset) for name in names})
+    text = f"position {position} looks counted from another zero"
+    for offset in offsets:
+        if abs(offset) > MIN_OFFSET:
+            yield Hypothesis(text, {position: Change(position, 1.0, offset)})
+
+
+def _wraps(joints: Sequence[Joint], recording: Recording) -> Iterator[Hypothesis]:
+    """Yield positions that leave whole turns out."""
+    for joint in joints:
+        name = joint.channels.get("q")
+        if name is None or not joint.is_hinge:
+            continue
+        jumps = [_largest_jump(run.channels[name]) for run in recording.training()]
+        if max(jumps) > WRAP_JUMP:
+            near = joint.servo_inputs[0] if joint.servo_inputs else ""
+            text = f"position {name} looks wrapped: whole turns are left out"
+            yield Hypothesis(text, {name: Change(name, unwrap=True, near=near)})
+
+
+def _largest_jump(values: Array) -> float:
+    """Return the largest difference of successive samples; missing samples are skipped."""
+    return float(np.abs(np.diff(values[np.isfinite(values)])).max(initial=0.0))
+
+
+def _orders(
+    joints: Sequence[Joint], recording: Recording, suspects: Sequence[Joint]
+) -> Iterator[Hypothesis]:
+    """Yield other orders of the joints: of channels, of commands, and of both.
+
+    Pairs of suspects are exchanged; whole orders are the alphabetical one, the reversed one, and
+    that in which positions follow commands best.
+    """
+    numbers = range(len(joints))
+    has_commands = all(len(joint.inputs) == 1 for joint in joints)
+    quantities = [q for q in QUANTITIES if all(q in joint.channels for joint in joints)]
+    orders = [{a: b, b: a} for a, b in combinations(numbers, 2) if _are(joints, (a, b), suspects)]
+    alphabetical = sorted(numbers, key=lambda i: joints[i].name)
+    orders += [
+        {i: alphabetical.index(i) for i in numbers},
+        dict(enumerate(alphabetical)),
+        {i: len(joints) - 1 - i for i in numbers},
+    ]
+    if has_commands and "q" in quantities:
+        orders.append(_order_of_commands(joints, recording))
+    for order in orders:
+        moved = {a: b for a, b in order.items() if a != b}
+        if not moved:
+            continue
+        names = listed([joints[a].name for a in sorted(moved)], MAX_NAMED)
+        channels = {
+            joints[a].channels[q]: Change(joints[b].channels[q])
+            for a, b in moved.items()
+            for q in quantities
+        }
+        if channels:
+            yield Hypothesis(f"the channels of {names} look exchanged", channels)
+        if not has_commands:
+            continue
+        commands = {joints[a].inputs[0]: Change(joints[b].inputs[0]) for a, b in moved.items()}
+        yield Hypothesis(f"the commands of {names} look exchanged", commands)
+        if channels:
+            text = f"the channels and commands of {names} look exchanged"
+            yield Hypothesis(text, {**channels, **commands})
+
+
+def _are(joints: Sequence[Joint], numbers: Sequence[int], suspects: Sequence[Joint]) -> bool:
+    return all(joints[i] in suspects for i in numbers)
+
+
+def _order_of_commands(joints: Sequence[Joint], recording: Recording) -> dict[int, int]:
+    """Return the order of positions that follows the commands best, by linear assignment."""
+    # SciPy's optimisers are slow to import.
+    from scipy.optimize import linear_sum_assignment
+
+    count = len(joints)
+    costs = np.zeros((count, count))
+    for run in recording.training():
+        for a, b in np.ndindex(count, count):
+            difference = run.channels[joints[b].channels["q"]] - run.inputs[joints[a].inputs[0]]
+            costs[a, b] += float(np.nanvar(difference))
+    rows, columns = linear_sum_assignment(costs)
+    return dict(zip(rows.tolist(), columns.tolist(), strict=True))
+
+
+def _units(signals: Sequence[Signal], recording: Recording) -> Iterator[Hypothesis]:
+    """Yield other units of signals that share one, and ticks where all numbers are whole."""
+    first = signals[0]
+    names = [signal.name for signal in signals]
+    text = listed(names, MAX_NAMED)
+    for unit, gain in UNITS.get(first.si, {}).items():
+        scale = first.scale * gain / first.gain
+        if not math.isclose(scale, 1.0, rel_tol=1e-6):
+            words, stated = (UNITS_IN_WORDS.get(one, one) for one in (unit, first.stated))
+            yield Hypothesis(
+                f"the numbers of {text} look like {words}, stated as {stated}",
+                {name: Change(name, scale) for name in names},
+                unit=unit,
+            )
+    if first.si != "rad" or not _are_whole(signals, recording):
+        return
+    for ticks in TICKS_PER_TURN:
+        scale = 2.0 * math.pi / ticks / first.gain
+        for zero in (0.0, math.pi):
+            yield Hypothesis(
+                f"the numbers of {text} look like ticks, {ticks:g} a turn",
+                {name: Change(name, scale, -zero) for name in names},
+                unit="ticks",
+            )
+
+
+def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
+    """Return whether all numbers of these columns are whole."""
+    for run in recording.training():
+        recorded = {**run.inputs, **run.channels}
+        for signal in signals:
+            numbers = recorded[signal.name] / signal.gain
+            numbers = numbers[np.isfinite(numbers)]
+            if not np.allclose(numbers, np.rint(numbers), rtol=0.0, atol=1e-6):
+                return False
+    return True
+
+
+def _late_commands(recording: Recording) -> Iterator[Hypothesis]:
+    """Yield commands that are stamped late, so that the robot answers before them."""
+    run = recording.runs[0]
+    if not run.inputs or run.times.size < 2:
+        return
+    interval = float(np.median(np.diff(run.times)))
+    for count in LATE_SAMPLES:
+        late = count * interval
+        text = f"commands look stamped {late:.4g} s late: the robot answers before them"
+        yield Hypothesis(text, late=late)

@@ -1,0 +1,1 @@
+"""Random logs with one convention broken, and sound ones."""
