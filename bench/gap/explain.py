@@ -369,7 +369,8 @@ class _Explainer:
         if not self.kind.has_model:
             return _Found(base, search, self._finding(search), rng)
         # Loaded where there is a robot alone.
-        from bench.gap.prediction_error.search import PredictionErrorSearch, SoftFrictionError
+        from bench.gap.prediction_error.dry_friction import SoftFrictionError
+        from bench.gap.prediction_error.search import PredictionErrorSearch
 
         stiff = _Worlds(self.kind, self.fitting, self.validation)
         try:

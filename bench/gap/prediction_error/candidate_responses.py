@@ -172,12 +172,8 @@ class FollowedRuns:
                 _linearised(world, theta, noise, run, motion[run], near, simulator)
                 for run, near in enumerate(nearby)
             ]
-            maps = [one.interval_maps() for one in linear]
-            prior = _prior(world, linear, maps[0].states.shape[1])
-            runs = LinearRuns.stacked(maps, world.observed, prior)
             begin = FIRST_FORCE * typical if force is None else force
-            fitted = _fit_noise(runs, noise, begin, typical)
-            found = cls(world, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
+            found = cls._of_linear(world, theta, noise, linear, begin, typical)
             force, noise, trajectories = found.force, found.noise, found.trajectories
             gain = np.inf if best is None else found.log_likelihood - best.log_likelihood
             # The first one is about the readings alone, which are not a motion.
@@ -202,12 +198,26 @@ class FollowedRuns:
             _linearised(self.world, theta, self.noise, run, motion, near, simulator, is_alike)
             for run, (motion, near) in enumerate(zip(self.trajectories, self.linear, strict=True))
         ]
+        given = self.noise, linear, self.force, self.typical
+        return self._of_linear(self.world, theta, *given)
+
+    @classmethod
+    def _of_linear(
+        cls,
+        world: World,
+        theta: Array,
+        noise: Noise,
+        linear: list[MeasuredLinear],
+        force: Array,
+        typical: Array,
+    ) -> FollowedRuns:
+        """Filter the linearised models of all runs; other arguments as those of `_fit_noise`."""
         maps = [one.interval_maps() for one in linear]
         # An effect may have states of its own.
-        prior = _prior(self.world, linear, maps[0].states.shape[1])
-        runs = LinearRuns.stacked(maps, self.world.observed, prior)
-        fitted = _fit_noise(runs, self.noise, self.force, self.typical)
-        return replace(self, theta=theta, linear=linear, runs=runs, **fitted._asdict())
+        prior = _prior(world, linear, maps[0].states.shape[1])
+        runs = LinearRuns.stacked(maps, world.observed, prior)
+        fitted = _fit_noise(runs, noise, force, typical)
+        return cls(world, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
 
     @classmethod
     def of_model(cls, world: World, theta: Array, noise: Noise) -> FollowedRuns:
@@ -268,6 +278,11 @@ class FollowedRuns:
         """(E,) whether the model lacks a force: the filter needs process noise there."""
         mask: Mask = self.losses_without_force > MIN_LOSS_WITHOUT_FORCE
         return mask
+
+    @property
+    def lacks_force(self) -> bool:
+        """Whether the model lacks a force at any coordinate."""
+        return bool(self.missing_forces.any())
 
     @property
     def joints_by_loss(self) -> list[int]:

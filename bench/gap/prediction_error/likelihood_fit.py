@@ -78,7 +78,7 @@ def identify_base(
         if tried.is_sound and not any(ends):
             found.append(tried)
         # The base parameters alone leave no force missing, so friction is not needed.
-        if found and not tried.missing_forces.any():
+        if found and not tried.lacks_force:
             break
     best = max(found, key=lambda one: one.log_likelihood, default=followed)
     if best.log_likelihood - followed.log_likelihood < CLEAR:
