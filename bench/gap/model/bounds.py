@@ -59,8 +59,7 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
 
 def clip_coefficients(world: World, name: str, c: Array) -> Array:
     """Limit the coefficients (k,) of an effect to the range in which a fit may move them."""
-    low, high = np.array(coefficient_bounds(world, name)).T
-    limited: Array = np.clip(c, low, high)
+    limited: Array = np.clip(c, *np.array(coefficient_bounds(world, name)).T)
     return limited
 
 

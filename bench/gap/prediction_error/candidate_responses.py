@@ -145,8 +145,7 @@ class FollowedRuns:
         world: World,
         theta: Array,
         noise: Noise,
-        trajectories: Sequence[Trajectory] | None,
-        simulator: RobotSimulator | None = None,
+        trajectories: Sequence[Trajectory] | None = None,
         force: Array | None = None,
     ) -> FollowedRuns:
         """Linearise a model about the measured motion and filter the runs.
@@ -156,7 +155,6 @@ class FollowedRuns:
             theta: (P,) parameters of the model.
             noise: of the sensors.
             trajectories: the motion of each run, if it has been estimated before.
-            simulator: in place of that of the world.
             force: (E,) missing forces with which the fit of the process noise begins.
         """
         assert isinstance(world.simulator, RobotSimulator)
@@ -169,7 +167,7 @@ class FollowedRuns:
             nearby: Sequence[MeasuredLinear | None] = linear or [None] * len(world.tracks)
             motion: Sequence[Trajectory | None] = trajectories or [None] * len(world.tracks)
             linear = [
-                _linearised(world, theta, noise, run, motion[run], near, simulator)
+                _linearised(world, theta, noise, run, motion[run], near)
                 for run, near in enumerate(nearby)
             ]
             begin = FIRST_FORCE * typical if force is None else force
@@ -367,38 +365,41 @@ class FollowedRuns:
         """Return the derivatives (R, T, C, 2 D) of the readings by the first positions and
         velocities of D joints, without any feedback of the readings.
         """
-        number, samples, channels = self.runs.residuals.shape
-        size, count = self.runs.prior.size, len(self.world.states)
         joints = len(self.linear[0].trajectory.x[0])
         own = np.concatenate([np.arange(joints), self.linear[0].positions + np.arange(joints)])
-        result = np.zeros((number, samples, channels, count))
-        s = np.zeros((number, size, own.size))
-        s[:, own, np.arange(own.size)] = 1.0
-        with np.errstate(all="ignore"):
-            for i in range(samples):
-                result[:, i, :, : own.size] = self.runs.readings[:, i] @ s
-                if i + 1 < samples:
-                    s = self.runs.states[:, i] @ s
-        result[~(np.abs(result) < LARGEST)] = 0.0
+        begin = np.zeros((len(self.linear), self.runs.prior.size, own.size))
+        begin[:, own, np.arange(own.size)] = 1.0
+        result = np.zeros((*self.runs.residuals.shape, len(self.world.states)))
+        result[..., : own.size] = self._without_gain(begin)
         return result
 
     def sensitivities(self, columns: Columns) -> Array:
         """Return what candidates change about the readings of simulated runs (R, T, C, K), by (1)
         without gain, in units of the probes' coefficients.
         """
-        number, samples, channels, count = columns.readings.shape
-        size = self.runs.prior.size
-        result = np.zeros((number, samples, channels, count))
-        s = np.zeros((number, size, count))
-        a, by = self.runs.states, self.runs.inputs
+        number, _, _, count = columns.readings.shape
+        changes = self._without_gain(np.zeros((number, self.runs.prior.size, count)), columns)
+        with np.errstate(all="ignore"):
+            return changes[..., columns.places] / columns.sizes
+
+    def _without_gain(self, s: Array, columns: Columns | None = None) -> Array:
+        """Carry changes of the first states (R, Z, K), and columns if there are any, through (1)
+        without gain.
+        """
+        runs = self.runs
+        samples = runs.residuals.shape[1]
+        result = np.zeros((*runs.residuals.shape, s.shape[2]))
         with np.errstate(all="ignore"):
             for i in range(samples):
-                result[:, i] = columns.readings[:, i] + self.runs.readings[:, i] @ s
+                result[:, i] = runs.readings[:, i] @ s
+                if columns is not None:
+                    result[:, i] += columns.readings[:, i]
                 if i + 1 < samples:
-                    s = a[:, i] @ s + by[:, i] @ columns.pushed[:, i]
+                    s = runs.states[:, i] @ s
+                    if columns is not None:
+                        s += runs.inputs[:, i] @ columns.pushed[:, i]
         result[~(np.abs(result) < LARGEST)] = 0.0
-        with np.errstate(all="ignore"):
-            return result[..., columns.places] / columns.sizes
+        return result
 
     @property
     def is_sound(self) -> bool:
@@ -531,11 +532,10 @@ def _linearised(
     scenario = world.tracks[run].scenario
     start = world.guess[run, :half], world.guess[run, half:]
     robot = simulator or world.simulator
-    given = trajectory
-    if given is None:
+    if trajectory is None:
         states = measured_states(world, noise.sigma, run)
         return MeasuredLinear(robot, theta, scenario, start, measured=states)
-    return MeasuredLinear(robot, theta, scenario, start, given, None, nearby, is_alike)
+    return MeasuredLinear(robot, theta, scenario, start, trajectory, None, nearby, is_alike)
 
 
 def _prior(world: World, linear: Sequence[MeasuredLinear], size: int) -> Array:

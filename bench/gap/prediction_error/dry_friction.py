@@ -12,7 +12,6 @@ from bench.gap.causes.rules import SWITCH
 from bench.gap.friction_form import (
     has_dry_friction,
     is_likelier_soft,
-    plain_friction,
     with_plain_friction,
 )
 from bench.gap.model.models import Model
@@ -21,7 +20,6 @@ from bench.gap.prediction_error.identification import Selected
 from bench.gap.prediction_error.search_context import SearchContext
 from bench.gap.prediction_error.selected_sets import without_surplus
 from bench.gap.prediction_error.simulated_fits import fit, is_explained, without_idle_effects
-from sims.base import Array
 from sims.robot.native import FIELDS
 
 
@@ -79,7 +77,7 @@ def check_fit(context: SearchContext, model: Model) -> None:
     Raises:
         SoftFrictionError: that is likelier.
     """
-    if is_likelier_soft(context.models, model, SWITCH):
+    if is_likelier_soft(context.search, model, SWITCH):
         raise SoftFrictionError
 
 
@@ -91,7 +89,7 @@ def fit_dry_friction(context: SearchContext, selected: Selected) -> Model:
     """
     friction = dry_friction_of(context, selected)
     if not friction.effects or not selected.followed.lacks_force:
-        return context.models.base
+        return context.search.base
     found = fit(context, friction)
     return without_idle_effects(context, found) if is_explained(context, found) else found
 
@@ -101,17 +99,16 @@ def dry_friction_of(context: SearchContext, selected: Selected) -> Start:
     a family in place of its members.
     """
     world, filters = context.world, context.filters
-    names = [
-        name
-        for name in dict.fromkeys(plain_friction(world, effect) for effect in selected.effects)
-        if name.partition("@")[0] in FIELDS and has_dry_friction(world, [name])
-    ]
-    contained = {part for name in names for part in world.effects[name].contains}
-    names = [name for name in names if name not in contained]
-    theta, own = filters.reference.copy(), _without_states(context, selected)
+    start = context.columns.start(selected.groups, selected.coefficients)
+    plain, own = with_plain_friction(world, start.effects, start.theta)
+    native = [name for name in plain if name.partition("@")[0] in FIELDS]
+    friction = [name for name in native if has_dry_friction(world, [name])]
+    contained = {part for name in friction for part in world.effects[name].contains}
+    names = tuple(name for name in friction if name not in contained)
+    theta = filters.reference.copy()
     for name in names:
         theta[world.slots[name]] = own[world.slots[name]]
-    return Start(tuple(names), theta, filters.first_states(filters.base))
+    return Start(names, theta, filters.first_states(filters.base))
 
 
 def stands_alone(context: SearchContext, selected: Selected, friction: Model) -> bool:
@@ -126,19 +123,13 @@ def stands_alone(context: SearchContext, selected: Selected, friction: Model) ->
         SoftFrictionError: the friction has MuJoCo's soft form.
     """
     filters = context.filters
-    theta = context.columns.start(selected.groups, selected.coefficients).theta
-    plain = _without_states(context, selected)
+    start = context.columns.start(selected.groups, selected.coefficients)
+    _, plain = with_plain_friction(context.world, start.effects, start.theta)
     stiff = filters.log_likelihood(plain)
     soft = -np.inf if filters.is_soft else filters.log_likelihood(plain, is_soft=True)
-    own = -np.inf if np.array_equal(plain, theta) else filters.log_likelihood(theta)
+    own = -np.inf if np.array_equal(plain, start.theta) else filters.log_likelihood(start.theta)
     if not max(stiff, soft) > own - 0.5 * SWITCH:
         return False
     if soft > max(stiff, own) + 0.5 * SWITCH:
         check_fit(context, friction)
     return True
-
-
-def _without_states(context: SearchContext, selected: Selected) -> Array:
-    """Return the parameters (P,) of a selection with dry friction in place of laws with a state."""
-    start = context.columns.start(selected.groups, selected.coefficients)
-    return with_plain_friction(context.world, start.effects, start.theta)[1]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from bench.gap.prediction_error.joint_effects import (
     SERVO_MODEL,
     joint_name,
     offset_from_command,
-    servo_name,
+    servo_input,
 )
 from bench.gap.prediction_error.library_columns import LibraryColumns, regression_about
 from bench.gap.prediction_error.likelihood_fit import gauss_newton_step
@@ -44,15 +43,6 @@ Proposals = list[tuple[str, Array]]
 """Names of effects, each with its first coefficients (k,)."""
 
 
-class _Proposed(NamedTuple):
-    """All proposals for one set, and the number of those of the joint and servo models, which come
-    last.
-    """
-
-    effects: Proposals
-    joint_model_size: int
-
-
 @dataclass
 class EffectProposals:
     """The proposals of a search.
@@ -60,50 +50,44 @@ class EffectProposals:
     Attributes:
         filters: the filters of the search.
         columns: the columns of the search.
+
+    Those for the base model are kept, by the number of columns of the library.
     """
 
     filters: ModelFilters
     columns: LibraryColumns
-    _for_base: dict[int, _Proposed] = field(default_factory=dict)
+    _for_base: dict[int, tuple[Proposals, Proposals]] = field(default_factory=dict)
 
-    def of(self, known: FilteredSet, most: int = MAX_JOINT_PROPOSALS) -> list[Start]:
+    def of(self, current: FilteredSet, most: int = MAX_JOINT_PROPOSALS) -> list[Start]:
         """Return models with one more effect than a set.
 
         Args:
-            known: the set.
+            current: the set.
             most: maximum number of effects of the joint and servo models.
         """
-        proposed = self._of_base(known) if not known.names else self._compute(known)
-        surplus = max(proposed.joint_model_size - most, 0)
-        world = self.filters.world
-        own = Start(known.names, known.followed.theta, world.guess)
-        effects = proposed.effects[: len(proposed.effects) - surplus]
-        return [with_effect(world, own, name, c) for name, c in effects]
+        world, count = self.filters.world, len(self.columns.library.probes)
+        proposed = self._propose(current) if current.names else self._for_base.get(count)
+        if proposed is None:
+            proposed = self._for_base[count] = self._propose(current)
+        first, joint_model = proposed
+        own = Start(current.names, current.followed.theta, world.guess)
+        return [with_effect(world, own, name, c) for name, c in first + joint_model[:most]]
 
-    def _of_base(self, known: FilteredSet) -> _Proposed:
-        """Return the proposals for the base model, computed once for each size of the library."""
-        count = len(self.columns.library.probes)
-        if count not in self._for_base:
-            self._for_base[count] = self._compute(known)
-        return self._for_base[count]
+    def _propose(self, current: FilteredSet) -> tuple[Proposals, Proposals]:
+        """Return all proposals, those of the joint and servo models apart."""
+        found = self._by_regression(current)
+        others, joint = {*current.names, *dict(found)}, current.followed.joints_by_loss[0]
+        joint_model = self._joint_model(current.followed, joint, others)
+        return found + self._offset_and_friction(joint, others), joint_model
 
-    def _compute(self, known: FilteredSet) -> _Proposed:
-        followed, names = known
-        found = self._by_regression(known)
-        others = {*names, *(name for name, _ in found)}
-        joint = followed.joints_by_loss[0]
-        joint_model = self._joint_model(followed, joint, others)
-        found += self._offset_and_friction(joint, others) + joint_model
-        return _Proposed(found, len(joint_model))
-
-    def _by_regression(self, known: FilteredSet) -> Proposals:
+    def _by_regression(self, current: FilteredSet) -> Proposals:
         """Return the effects that gain most by regression, each with its coefficients."""
-        regression, _ = regression_about(known, self.columns.library, known.followed)
-        gains = regression.gains([]) - np.array([regression.price(g) for g in regression.groups])
+        regression, _ = regression_about(current, self.columns.library, current.followed)
+        gains = regression.net_gains()
         found: dict[str, Array] = {}
         for i in np.argsort(-gains, kind="stable").tolist():
             group = regression.groups[i]
-            if group.effect in (*known.names, *found):
+            if group.effect in (*current.names, *found):
                 continue
             too_little = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
             if len(found) == MAX_REGRESSION_PROPOSALS or too_little:
@@ -112,7 +96,7 @@ class EffectProposals:
             found[group.effect] = self.columns.coefficients(group, solution)
         return list(found.items())
 
-    def _offset_and_friction(self, joint: int, known: Collection[str]) -> Proposals:
+    def _offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:
         """Return the offset of a joint's encoder, and less dry friction than the model file states,
         which a derivative by more friction does not tell.
         """
@@ -124,10 +108,12 @@ class EffectProposals:
         return [
             (name, np.array([c]))
             for name, c in found.items()
-            if c and name in world.library and name not in known
+            if c and name in world.library and name not in excluded
         ]
 
-    def _joint_model(self, followed: FollowedRuns, joint: int, known: Collection[str]) -> Proposals:
+    def _joint_model(
+        self, followed: FollowedRuns, joint: int, excluded: Collection[str]
+    ) -> Proposals:
         """Return viscous and dry friction and armature of a joint, and stiffness and damping of its
         servo, those first by which the likelihood gains most.
         """
@@ -139,10 +125,11 @@ class EffectProposals:
             f"inertia.armature@{place}": float(scales(world.simulator.robot).inertia[joint]),
         }
         effects = [f"{effect}@{place}" for effect in JOINT_MODEL]
-        effects += [f"{effect}@{servo_name(world, joint)}" for effect in SERVO_MODEL]
+        servo = servo_input(world, joint).removeprefix("u.")
+        effects += [f"{effect}@{servo}" for effect in SERVO_MODEL]
         found = []
         for name in effects:
-            if name in world.library and name not in known:
+            if name in world.library and name not in excluded:
                 places, bounds = world.places(name), coefficient_bounds(world, name)
                 step, gain = gauss_newton_step(followed, places, bounds)
                 change = float(step[places[0]])

@@ -72,7 +72,7 @@ def add_to_dry_friction(context: SearchContext, selected: Selected, friction: Mo
         SoftFrictionError: the friction has MuJoCo's soft form.
     """
     if not friction.names or not stands_alone(context, selected, friction):
-        return context.models.base
+        return context.search.base
     return select_in_model(context, dry_friction_of(context, selected))
 
 
@@ -86,8 +86,8 @@ def select_in_model(context: SearchContext, friction: Start | None = None) -> Mo
     Raises:
         SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
     """
-    watch, filters, base = context.world.watch, context.filters, context.models.base
-    begin = FilteredSet(filters.base, ())
+    watch, filters, base = context.world.watch, context.filters, context.search.base
+    begin = filters.empty_set
     if friction is not None:
         begin = filters.with_effects(friction.theta, friction.effects)
     first = _larger_that_pay(context, begin)
@@ -112,31 +112,31 @@ def select_in_model(context: SearchContext, friction: Start | None = None) -> Mo
     return without_idle_effects(context, best)
 
 
-def _grow(context: SearchContext, known: FilteredSet) -> FilteredSet:
+def _grow(context: SearchContext, current: FilteredSet) -> FilteredSet:
     """Add effects to a set while each pays."""
     for _ in range(MAX_STEPS - 1):
-        larger = _larger_that_pay(context, known) if known.followed.lacks_force else []
+        larger = _larger_that_pay(context, current) if current.followed.lacks_force else []
         if not larger:
             break
-        known = larger[0]
-    return known
+        current = larger[0]
+    return current
 
 
-def _larger_that_pay(context: SearchContext, known: FilteredSet) -> list[FilteredSet]:
+def _larger_that_pay(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
     """Return sets with one more effect whose likelihood pays for it, the likeliest first."""
     filters = context.filters
     base = filters.log_likelihood(filters.reference)
-    own = known.followed.log_likelihood if known.names else base
+    own = current.followed.log_likelihood if current.names else base
     share = LEAST_SHARE * 2.0 * (own - base)
     return [
         larger
-        for larger in try_one_more(context, known)
+        for larger in try_one_more(context, current)
         if 2.0 * (larger.followed.log_likelihood - own)
         >= max(filters.penalty(larger.names[-1]), share)
     ]
 
 
-def try_one_more(context: SearchContext, known: FilteredSet) -> list[FilteredSet]:
+def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
     """Follow the runs with each effect that gains most in addition to a set.
 
     Return the likeliest sets, the likeliest first; none where no effect gains.
@@ -144,7 +144,7 @@ def try_one_more(context: SearchContext, known: FilteredSet) -> list[FilteredSet
     watch, filters = context.world.watch, context.filters
     watch.stage("testing effects in the model one by one", MAX_REGRESSION_PROPOSALS)
     tried = []
-    for start in context.proposals.of(known):
+    for start in context.proposals.of(current):
         tried.append(filters.with_effects(start.theta, start.effects, 0))
         watch.advance()
         watch.check()
@@ -179,16 +179,16 @@ def _nearly_as_likely(
     return [*near, *tried[len(near) : MAX_FIRST_EFFECTS]]
 
 
-def _gain(context: SearchContext, known: FilteredSet) -> float:
+def _gain(context: SearchContext, current: FilteredSet) -> float:
     """Return the gain of a set over the base model in twice the log likelihood."""
     base = context.filters.log_likelihood(context.filters.reference)
-    return 2.0 * (known.followed.log_likelihood - base)
+    return 2.0 * (current.followed.log_likelihood - base)
 
 
-def _criterion(context: SearchContext, known: FilteredSet) -> float:
+def _criterion(context: SearchContext, current: FilteredSet) -> float:
     """Return the penalised log likelihood of a set's last effect, as an information criterion."""
-    penalty = context.filters.penalty(known.names[-1])
-    return penalty - 2.0 * known.followed.log_likelihood
+    penalty = context.filters.penalty(current.names[-1])
+    return penalty - 2.0 * current.followed.log_likelihood
 
 
 def _fit_all_servos(context: SearchContext) -> Model:
@@ -199,5 +199,5 @@ def _fit_all_servos(context: SearchContext) -> Model:
     filters = context.filters
     several = filters.base.missing_forces.sum() > 1
     if not several or not set(names) <= set(context.world.library):
-        return context.models.base
+        return context.search.base
     return fit_filtered(context, filters.with_effects(filters.reference, names, ALL_SERVOS_STEPS))

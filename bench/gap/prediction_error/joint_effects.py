@@ -39,9 +39,9 @@ def joint_name(world: World, joint: int) -> str:
     return coordinate.removeprefix("q.")
 
 
-def servo_name(world: World, joint: int) -> str:
-    """Return the name of the position servo of a joint; empty where it has none."""
-    return str(getattr(world.simulator.system, "servos", {}).get(joint, "")).removeprefix("u.")
+def servo_input(world: World, joint: int) -> str:
+    """Return the input of the position servo of a joint; empty where it has none."""
+    return str(getattr(world.simulator.system, "servos", {}).get(joint, ""))
 
 
 def acts_at(world: World, name: str, joints: Collection[int]) -> bool:
@@ -97,10 +97,9 @@ def offset_from_command(world: World, noise: Noise, joint: int) -> float:
     """Return the mean difference of a joint's readings from the command of its position servo; zero
     without a servo, or where the difference is small.
     """
-    system = world.simulator.system
+    system, servo = world.simulator.system, servo_input(world, joint)
     channel = system.coordinates[joint]
-    servo = getattr(system, "servos", {}).get(joint)
-    if servo is None or channel not in world.channels:
+    if not servo or channel not in world.channels:
         return 0.0
     column = world.channels.index(channel)
     differences = [

@@ -126,9 +126,9 @@ class LibraryColumns:
         """
         key = model.fit.theta.tobytes()
         if key not in self._regressions:
-            now = FilteredSet(self.filters.of_model(model), model.names)
+            current = FilteredSet(self.filters.of_model(model), model.names)
             columns = self.library.joined(self.hats)
-            self._regressions[key] = regression_about(now, columns, self.filters.base)
+            self._regressions[key] = regression_about(current, columns, self.filters.base)
         return self._regressions[key]
 
     def sensitivities(self, start: Start) -> Known:
@@ -151,25 +151,27 @@ class LibraryColumns:
         return Known(np.array(places, dtype=np.intp), np.stack(derivatives, axis=-1))
 
 
-def regression_about(now: FilteredSet, columns: Columns, followed: FollowedRuns) -> ModelRegression:
+def regression_about(
+    current: FilteredSet, columns: Columns, followed: FollowedRuns
+) -> ModelRegression:
     """Set up the regression with effects in the model.
 
     Args:
-        now: the runs as a filter with these effects follows them.
+        current: the runs as a filter with these effects follows them.
         columns: of the candidates.
         followed: the runs as that filter follows them about whose motion the effects act.
     """
     own: dict[str, list[int]] = {}
     probes: list[Probe] = []
     count = len(columns.probes)
-    for name in now.names:
-        tangents = _tangents(followed.world, name, now.followed.theta)
+    for name in current.names:
+        tangents = _tangents(followed.world, name, current.followed.theta)
         first = count + len(probes)
         own[name] = list(range(first, first + len(tangents)))
         probes += tangents
     joined = columns.joined(followed.columns(probes)) if probes else columns
     always = range(count, len(joined.probes))
-    return ModelRegression(regress(now.followed, joined, always=always), own)
+    return ModelRegression(regress(current.followed, joined, always=always), own)
 
 
 def _tangents(world: World, name: str, theta: Array) -> list[Probe]:

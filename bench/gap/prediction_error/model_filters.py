@@ -84,6 +84,11 @@ class ModelFilters:
         """The runs as a filter follows them with the base model."""
         return FollowedRuns.of_model(self.world, self.reference, self.noise)
 
+    @property
+    def empty_set(self) -> FilteredSet:
+        """The base model as a set of effects."""
+        return FilteredSet(self.base, ())
+
     def of_model(self, model: Model) -> FollowedRuns:
         """Return the runs as a filter follows them with a fitted model."""
         if not model.names:

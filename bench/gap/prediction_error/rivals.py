@@ -23,7 +23,7 @@ from bench.gap.prediction_error.joint_effects import (
     has_series,
     plain_effects_beside,
 )
-from bench.gap.prediction_error.model_filters import GAUSS_NEWTON_STEPS, FilteredSet
+from bench.gap.prediction_error.model_filters import GAUSS_NEWTON_STEPS
 from bench.gap.prediction_error.search_context import SearchContext
 from bench.gap.prediction_error.simulated_fits import (
     fit_filtered,
@@ -64,7 +64,7 @@ def fit_single_in_place(context: SearchContext, best: Model) -> Model:
     if not explained or has_series(context.world, best.names) or context.world.watch.left():
         return best
     filters = context.filters
-    tried = try_one_more(context, FilteredSet(filters.base, ()))
+    tried = try_one_more(context, filters.empty_set)
     if not tried:
         return best
     (name,) = tried[0].names
@@ -77,7 +77,7 @@ def fit_single_in_place(context: SearchContext, best: Model) -> Model:
 
 def fit_rivals(context: SearchContext, best: Model) -> Model:
     """Fit the sets that do nearly as well by the regression, and return the best of all."""
-    models, world = context.models, context.world
+    search, world = context.search, context.world
     lost = not best.names or not np.isfinite(best.fit.cost)
     if lost or has_series(world, best.names):
         return best
@@ -85,22 +85,22 @@ def fit_rivals(context: SearchContext, best: Model) -> Model:
     for name in best.names:
         for rival in _find_rivals(context, best, name):
             start = in_place_of(world, best, [name], rival.effect, rival.c)
-            if frozenset(start.effects) in models.models:
+            if frozenset(start.effects) in search.models:
                 continue
             near = _confirm_by_filter(context, best, rival, start)
             starts += [near] if near is not None else []
     if starts:
-        models.refit(starts, race=False)
+        search.refit(starts, race=False)
     size = len(best.names)
     if size == 1 and context.filters.base.runs.jumps.any():
         # Fits at force limits are caught.
-        known = [m for m in models.models.values() if len(m.names) == 1 and m is not best]
+        known = [m for m in search.models.values() if len(m.names) == 1 and m is not best]
         laws = JOINT_MODEL + SERVO_MODEL
         plain = [model for model in known if model.names[0].partition("@")[0] in laws]
         refine_single_effects(context, plain)
     _fit_at_coupled_joints(context, size)
     _refine_near(context, size)
-    likeliest = models.best(size)
+    likeliest = search.best(size)
     return best if likeliest is None else likeliest
 
 
@@ -110,7 +110,7 @@ def _find_rivals(context: SearchContext, model: Model, name: str) -> list[_Rival
     regression, columns = context.columns.regression(model)
     rest = regression.instead_of(columns[name])
     # What has more coefficients gains more by chance.
-    gains = rest.gains([]) - np.array([rest.price(group) for group in rest.groups])
+    gains = rest.net_gains()
     own = rest.gain_of(columns[name]) - context.filters.penalty(name)
     same_joint = plain_effects_beside(world, name)
     found, near_count = dict[str, _Rival](), 0
@@ -148,7 +148,7 @@ def _confirm_by_filter(
 
 def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
     """Fit the best models of a size with each effect at the other joints of its loop."""
-    models, world = context.models, context.world
+    search, world = context.search, context.world
     starts: dict[frozenset[str], Start] = {}
     for model in _near_the_best(context, size):
         for name in model.names:
@@ -156,28 +156,28 @@ def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
             for other in at_coupled_joints(world, name):
                 start = in_place_of(world, model, [name], other, c)
                 key = frozenset(start.effects)
-                if other not in model.names and key not in models.models:
+                if other not in model.names and key not in search.models:
                     starts[key] = start
     if starts:
-        models.refit(list(starts.values()), race=False)
+        search.refit(list(starts.values()), race=False)
 
 
 def _refine_near(context: SearchContext, size: int) -> None:
     """Fit the models of a size whose merit is near the best until nothing is left to gain, so that
     incomplete fits do not decide between them.
     """
-    models, near = context.models, _near_the_best(context, size)
+    search, near = context.search, _near_the_best(context, size)
     if context.world.watch.left() or len(near) < 2:
         return
-    fitter = Fitter(context.world, models.noise, models.frozen, exact=True)
+    fitter = Fitter(context.world, search.noise, search.frozen, exact=True)
     starts = [model.fit.start() for model in near]
     for model, fit in zip(near, fitter.fit(starts, STEPS), strict=True):
         if fit.cost < model.fit.cost:
-            models.enter(fit)
+            search.enter(fit)
 
 
 def _near_the_best(context: SearchContext, size: int) -> list[Model]:
     """Return the models with a number of effects whose merit is near that of the best of them."""
-    of_size = [m for m in context.models.models.values() if len(m.names) == size]
+    of_size = [m for m in context.search.models.values() if len(m.names) == size]
     highest = max((model.merit for model in of_size), default=-np.inf)
     return [model for model in of_size if model.merit > highest - RIVAL_MARGIN]

@@ -87,16 +87,13 @@ class PredictionErrorSearch(Search):
         Raises:
             SoftFrictionError: dry friction of the data has MuJoCo's soft form.
         """
-        self.supported = self.base
-        self.supported = self._fit_likely() or self._find()
-        return self.supported
-
-    def _fit_likely(self) -> Model | None:
-        """Fit the model that may explain the runs; return None where it does not."""
-        if self.likely is None:
-            return None
-        found = without_idle_effects(self._context, fit(self._context, self.likely))
-        return found if is_explained(self._context, found) else None
+        context, self.supported, best = self._context, self.base, None
+        if self.likely is not None:
+            best = without_idle_effects(context, fit(context, self.likely))
+        if best is None or not is_explained(context, best):
+            best = self._find()
+        self.supported = best
+        return best
 
     def _find(self) -> Model:
         """Select, fit and add effects until a set leaves no more than noise."""

@@ -16,25 +16,25 @@ class SearchContext:
     """The state of a search.
 
     Attributes:
-        models: what has been fitted by simulation.
+        search: with the models that have been fitted by simulation.
         filters: filters with effects in the model.
         columns: columns of regressions.
         proposals: effects that a set may lack.
     """
 
-    models: Search
+    search: Search
     filters: ModelFilters
     columns: LibraryColumns
     proposals: EffectProposals
 
     @classmethod
-    def of(cls, models: Search) -> SearchContext:
+    def of(cls, search: Search) -> SearchContext:
         """Return the context of a search that begins."""
-        filters = ModelFilters(models)
+        filters = ModelFilters(search)
         columns = LibraryColumns(filters)
-        return cls(models, filters, columns, EffectProposals(filters, columns))
+        return cls(search, filters, columns, EffectProposals(filters, columns))
 
     @property
     def world(self) -> World:
         """The runs for fitting."""
-        return self.models.world
+        return self.search.world

@@ -36,13 +36,13 @@ def fit_quick_selection(context: SearchContext, selected: Selected) -> Model:
     kept = without_surplus(context, selected)
     slow = len(kept.groups) > MAX_SLOW_EFFECTS and _is_slow(context, kept)
     if slow and selected.followed.lacks_force:
-        return context.models.base
+        return context.search.base
     return fit_selection(context, kept)
 
 
 def fit_selection(context: SearchContext, selected: Selected) -> Model:
     """Fit the selected set by simulation, and leave out effects that do not pay there."""
-    base = context.models.base
+    base = context.search.base
     if not selected.groups:
         return base
     start = context.columns.start(selected.groups, selected.coefficients)
@@ -52,7 +52,7 @@ def fit_selection(context: SearchContext, selected: Selected) -> Model:
         return base
     found = without_idle_effects(context, found)
     if selected.shows_steps:
-        found = context.models.without_step_errors(found)
+        found = context.search.without_step_errors(found)
     return higher_merit(found, base)
 
 

@@ -36,13 +36,13 @@ def fit(context: SearchContext, start: Start) -> Model:
     """Fit a set by simulation; where that leaves much, again with derivatives by the first states
     about the simulated motion, since those about the measured one may not hold.
     """
-    models, world = context.models, context.world
-    found = models.fit_one(start)
+    search, world = context.search, context.world
+    found = search.fit_one(start)
     if is_explained(context, found) or not np.isfinite(found.fit.cost):
         return found
     before = world.derivatives
     begun(world, found.fit.theta, found.fit.states, anew=True)
-    found = models.fit_one(found.fit.start())
+    found = search.fit_one(found.fit.start())
     if not is_explained(context, found):
         # Derivatives about a wrong motion hold for no other model.
         world.derivatives = before
@@ -52,16 +52,16 @@ def fit(context: SearchContext, start: Start) -> Model:
     return found
 
 
-def fit_filtered(context: SearchContext, known: FilteredSet) -> Model:
+def fit_filtered(context: SearchContext, current: FilteredSet) -> Model:
     """Fit a set by simulation, from the coefficients in its filter."""
-    states = context.filters.first_states(known.followed)
-    return fit(context, Start(known.names, known.followed.theta, states))
+    states = context.filters.first_states(current.followed)
+    return fit(context, Start(current.names, current.followed.theta, states))
 
 
 def fit_nearby(context: SearchContext, model: Model, name: str) -> Model:
     """Fit a model again from the best of some coefficients of an effect nearby."""
     ((cost, start),) = lowest_of_each(context, starts_nearby(context, model, name))
-    return context.models.fit_one(start) if cost < model.fit.cost else model
+    return context.search.fit_one(start) if cost < model.fit.cost else model
 
 
 def starts_nearby(context: SearchContext, model: Model, name: str) -> list[Start]:
@@ -84,7 +84,7 @@ def lowest_of_each(context: SearchContext, starts: Sequence[Start]) -> list[tupl
     """
     if not starts:
         return []
-    costs = costs_of_starts(context.world, context.models.noise, starts, share=1.0, lost=np.inf)
+    costs = costs_of_starts(context.world, context.search.noise, starts, share=1.0, lost=np.inf)
     lowest: dict[tuple[str, ...], tuple[float, Start]] = {}
     for i in np.argsort(costs, kind="stable").tolist():
         lowest.setdefault(starts[i].effects, (float(costs[i]), starts[i]))
@@ -98,19 +98,19 @@ def is_explained(context: SearchContext, model: Model) -> bool:
     # Friction of the other form leaves a small residual.
     if has_dry_friction(context.world, model.names) and not context.filters.is_soft:
         return False
-    excess = context.models.excess
-    return excess(model) < min(NEGLIGIBLE, NEGLIGIBLE_SHARE * excess(context.models.base))
+    excess = context.search.excess
+    return excess(model) < min(NEGLIGIBLE, NEGLIGIBLE_SHARE * excess(context.search.base))
 
 
 def is_at_noise(context: SearchContext, model: Model) -> bool:
     """Whether a fitted model leaves no more than noise."""
-    return context.models.quiet(model) and context.models.excess(model) < EXPLAINED_EXCESS
+    return context.search.quiet(model) and context.search.excess(model) < EXPLAINED_EXCESS
 
 
 def is_nearly_explained(context: SearchContext, model: Model) -> bool:
     """Whether a model closes most of the gap."""
-    excess = context.models.excess
-    return excess(model) < NEARLY_EXPLAINED * excess(context.models.base)
+    excess = context.search.excess
+    return excess(model) < NEARLY_EXPLAINED * excess(context.search.base)
 
 
 def higher_merit(one: Model, other: Model) -> Model:
@@ -120,9 +120,9 @@ def higher_merit(one: Model, other: Model) -> Model:
 
 def without_idle_effects(context: SearchContext, model: Model) -> Model:
     """Remove effects that do not pay, and replace a family by a member that does as well."""
-    model = _merge_into_families(context, context.models.drop(model))
+    model = _merge_into_families(context, context.search.drop(model))
     families = any(name.endswith("@*") for name in model.names)
-    return context.models.plainer(model) if families else model
+    return context.search.plainer(model) if families else model
 
 
 def _merge_into_families(context: SearchContext, model: Model) -> Model:
@@ -135,7 +135,7 @@ def _merge_into_families(context: SearchContext, model: Model) -> Model:
         own = np.concatenate([model.fit.theta[world.slots[name]] for name in members])
         if own.size != len(world.places(family)):
             continue
-        fitted = context.models.fit_one(in_place_of(world, model, members, family, own))
+        fitted = context.search.fit_one(in_place_of(world, model, members, family, own))
         model = fitted if fitted.merit > model.merit - SWITCH else model
     return model
 

@@ -14,7 +14,6 @@ from bench.gap.model.problem import Start
 from bench.gap.prediction_error.dry_friction import check_filter, check_fit
 from bench.gap.prediction_error.identification import Selected
 from bench.gap.prediction_error.joint_effects import JOINT_MODEL, SERVO_MODEL, acts_at
-from bench.gap.prediction_error.model_filters import FilteredSet
 from bench.gap.prediction_error.search_context import SearchContext
 from bench.gap.prediction_error.simulated_fits import (
     fit,
@@ -43,19 +42,18 @@ def fit_single_effects(context: SearchContext) -> Model:
     Raises:
         SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
     """
-    models, filters = context.models, context.filters
+    search, filters = context.search, context.filters
     states = filters.first_states(filters.base)
-    empty = FilteredSet(filters.base, ())
-    starts = context.proposals.of(empty, len(JOINT_MODEL + SERVO_MODEL))
-    found = models.fit_all([replace(start, states=states) for start in starts])
-    best = max(found, key=lambda model: model.merit, default=models.base)
+    starts = context.proposals.of(filters.empty_set, len(JOINT_MODEL + SERVO_MODEL))
+    found = search.fit_all([replace(start, states=states) for start in starts])
+    best = max(found, key=lambda model: model.merit, default=search.base)
     if not is_explained(context, best):
         best = higher_merit(best, refine_single_effects(context, found))
     if is_explained(context, best):
         return without_idle_effects(context, best)
     check_filter(context, filters.of_model(best).log_likelihood)
     check_fit(context, best)
-    return models.base
+    return search.base
 
 
 def refine_single_effects(context: SearchContext, fitted: Sequence[Model]) -> Model:
@@ -70,7 +68,7 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[Model]) -> Mo
         (name,) = model.names
         if len(context.world.places(name)) <= MAX_IMPROVED_SIZE:
             starts += [model.fit.start(), *starts_nearby(context, model, name)]
-    best = context.models.base
+    best = context.search.base
     for _, start in lowest_of_each(context, starts)[:MAX_REFINED]:
         found = fit(context, start)
         if not is_at_noise(context, found) and is_nearly_explained(context, found):
@@ -86,16 +84,16 @@ def fit_series_effects(context: SearchContext, selected: Selected) -> Model:
 
     They have states of their own, so that each shape is simulated.
     """
-    world, models = context.world, context.models
+    world, search = context.world, context.search
     joints = selected.followed.joints_by_loss[:1]
     names = [name for name in world.library if is_series(world.effects[name])]
     probes = context.columns.probes([name for name in names if acts_at(world, name, joints)])
     if not probes:
-        return models.base
+        return search.base
     world.watch.stage("testing elasticity and play between drives and links", len(probes))
     starts = []
     for probe in probes:
         theta = context.filters.theta_with(probe.effect, probe.c)
         starts.append(Start((probe.effect,), theta, world.guess))
-    found = models.fit_all([start for _, start in lowest_of_each(context, starts)])
+    found = search.fit_all([start for _, start in lowest_of_each(context, starts)])
     return fit(context, max(found, key=lambda model: model.merit).fit.start())
