@@ -372,7 +372,7 @@ class _Explainer:
         if not self.kind.has_model:
             return _Found(base, search, self._finding(search), rng)
         # Loaded where there is a robot alone.
-        from bench.gap.prediction_error.search import PredictionErrorSearch, SoftFrictionError
+        from bench.gap.prediction_error.dry_friction import SoftFrictionError
 
         stiff = _Worlds(self.kind, self.fitting, self.validation)
         try:
@@ -390,9 +390,7 @@ class _Explainer:
         self.say(STIFF_FRICTION)
         before = self.assessor.before
         self._return(stiff, before)
-        again = self._search(base, rng)
-        assert isinstance(again, PredictionErrorSearch)
-        again.is_form_given = True
+        again = self._search(base, rng, is_form_given=True)
         try:
             return _Found(base, again, self._finding(again), rng)
         except SoftFrictionError as error:
@@ -483,9 +481,7 @@ class _Explainer:
             return name(search, self.validation)
         # Loaded where there is a robot alone.
         from bench.gap.prediction_error.confirmation import Confirmation
-        from bench.gap.prediction_error.search import PredictionErrorSearch
 
-        assert isinstance(search, PredictionErrorSearch)
         return answer(Confirmation(search, self.validation))
 
     def _unexplained(self, search: Search, finding: Finding) -> tuple[RecordingFault, ...]:
@@ -531,20 +527,18 @@ class _Explainer:
                 return design(search, finding.model, rivals, seconds, longest)
         return design(search, finding.model, (), seconds, longest)
 
-    def _search(self, base: Base, rng: np.random.Generator) -> Search:
+    def _search(self, base: Base, rng: np.random.Generator, **attributes: Any) -> Search:
+        """Begin a search, by prediction errors where the simulator can be linearised."""
+        kind = Search
+        if self.fitting.followed is not None:
+            # Loaded where there is a robot alone.
+            from bench.gap.prediction_error.search import PredictionErrorSearch
+
+            kind = PredictionErrorSearch
         given = self.fitting, self.noise, base.frozen, rng, self.floor.stated
-        search = self._kind_of_search()(*given, thorough=self.thorough)
+        search = kind(*given, thorough=self.thorough, **attributes)
         search.enter(base.fit)
         return search
-
-    def _kind_of_search(self) -> type[Search]:
-        """Search by prediction errors where the simulator can be linearised."""
-        if self.fitting.followed is None:
-            return Search
-        # Loaded where there is a robot alone.
-        from bench.gap.prediction_error.search import PredictionErrorSearch
-
-        return PredictionErrorSearch
 
     def _base(self) -> Base:
         """The base model; of a robot with the step that the data ask for, the file's or a finer
@@ -582,7 +576,7 @@ class _Explainer:
 
         self.watch.stage("following the runs with the model")
         world, *held_out = self._worlds()
-        followed = FollowedRuns.follow(world, world.nominal(), self.noise, None)
+        followed = FollowedRuns.follow(world, world.nominal(), self.noise)
         # Where the linear model diverges, causes are searched by simulation.
         if not followed.is_sound:
             return
@@ -591,7 +585,7 @@ class _Explainer:
         world.follow(followed)
         for world in held_out:
             # Held-out runs are simulated alone, and begin at their readings without a filter.
-            found = FollowedRuns.follow(world, world.nominal(), self.noise, None)
+            found = FollowedRuns.follow(world, world.nominal(), self.noise)
             if found.is_sound:
                 world.follow(found)
 

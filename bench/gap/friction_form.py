@@ -14,6 +14,7 @@ from bench.gap.model.models import Model, Models
 from bench.gap.model.problem import Start
 from bench.gap.model.world import World
 from bench.problem.seeds import rng_for
+from sims.base import Array
 from sims.simulated import Simulated
 from sims.system import Effect, Friction, members_of
 
@@ -41,12 +42,16 @@ def has_dry_friction(world: World, names: Iterable[str]) -> bool:
     return any(_is_dry_friction(effect) for effect in effects)
 
 
+def has_soft_form(world: World) -> bool:
+    """Whether the effects of a robot add dry friction in MuJoCo's soft form."""
+    robot: Any = world.kind
+    return bool(robot.has_model and robot.robot.friction_form == "soft")
+
+
 def form_of(world: World, name: str) -> str | None:
     """``soft`` where an effect is dry friction in MuJoCo's soft form; None for all others."""
-    robot: Any = world.kind
-    if not robot.has_model or robot.robot.friction_form == "stiff":
-        return None
-    return "soft" if _is_dry_friction(type(world.effects[name])) else None
+    is_soft = has_soft_form(world) and _is_dry_friction(type(world.effects[name]))
+    return "soft" if is_soft else None
 
 
 def with_solver_parameters(world: World, name: str, says: str) -> str:
@@ -75,8 +80,7 @@ def is_likelier_soft(models: Models, model: Model, margin: float) -> bool:
         model: one of them.
         margin: by which twice the log likelihood has to be larger.
     """
-    robot: Any = models.world.kind
-    if not has_dry_friction(models.world, model.names) or robot.robot.friction_form == "soft":
+    if not has_dry_friction(models.world, model.names) or has_soft_form(models.world):
         return False
     other = models.world.with_kind(soft_kind(models.world.kind))
     try:
@@ -108,19 +112,10 @@ def choose_friction_form(models: Models, model: Model, other: World, margin: flo
 
 def _refit_in(world: World, models: Models, model: Model) -> Model:
     """Fit the effects of a model in a world of the other form."""
-    theta = model.fit.theta.copy()
-    names: list[str] = []
-    for name in model.names:
-        plain = plain_friction(models.world, name)
-        if plain != name:
-            # The first coefficient of both is the limit of the friction.
-            theta[world.places(plain)[0]] += theta[world.places(name)[0]]
-            theta[world.places(name)] = 0.0
-        names += [plain] if plain not in names else []
+    names, theta = with_plain_friction(models.world, model.names, model.fit.theta)
     # The random numbers of these models decide nothing.
     others = Models(world, models.noise, models.frozen, rng_for("friction form"), models.stated)
-    others.refit([Start(tuple(names), theta, model.fit.states)], race=False)
-    fitted = others.models[frozenset(names)]
+    fitted = others.fit_one(Start(names, theta, model.fit.states))
     if models.world.correction is None:
         return fitted
     # Both forms are compared without the error of the integrator's step.
@@ -128,8 +123,7 @@ def _refit_in(world: World, models: Models, model: Model) -> Model:
 
     correct(world, models.noise, fitted.fit.theta, fitted.fit.states)
     others.models.clear()
-    others.refit([fitted.fit.start()], race=False)
-    return others.models[frozenset(names)]
+    return others.fit_one(fitted.fit.start())
 
 
 def _is_dry_friction(effect: type[Effect]) -> bool:
@@ -146,3 +140,27 @@ def plain_friction(world: World, name: str) -> str:
     contained = [n for n in effect.contains if n in world.effects]
     friction = [n for n in contained if _is_dry_friction(type(world.effects[n]))]
     return friction[0] if friction else name
+
+
+def with_plain_friction(
+    world: World, names: Iterable[str], theta: Array
+) -> tuple[tuple[str, ...], Array]:
+    """Put dry friction in the place of effects with a state that contain it.
+
+    Args:
+        world: the runs.
+        names: effects of a model.
+        theta: (P,) its parameters.
+
+    Returns:
+        The names and the parameters of the model without these states.
+    """
+    theta, plain = theta.copy(), dict[str, None]()
+    for name in names:
+        friction = plain_friction(world, name)
+        plain[friction] = None
+        if friction != name:
+            # The first coefficient of both is the limit of the friction.
+            theta[world.places(friction)[0]] += theta[world.places(name)[0]]
+            theta[world.places(name)] = 0.0
+    return tuple(plain), theta

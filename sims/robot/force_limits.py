@@ -16,34 +16,26 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sims.base import Array
-
-Places = NDArray[np.intp]
+from sims.robot.inertia_matrix import inertia_matrix
 
 STIFF = 0.1
 """The r from which a servo is stiff."""
 NEAR = 0.9
 """Share of a limit from which a force may have been at it: its state is not known exactly."""
-LIMIT_FIELDS = ("actuator_force", "qfrc_actuator")
-"""What MuJoCo computes that is limited: forces of actuators, and their sums at joints."""
 
 
 class ForceLimits(NamedTuple):
     """K force limits of stiff servos.
 
     Attributes:
-        dofs: (K,) degrees of freedom where they act.
-        fields: of each, which of `LIMIT_FIELDS` it limits.
-        columns: (K,) of this field.
+        outputs: of each, the force that it limits: a field of MuJoCo's data and its column.
         sizes: (K,) forces from which they may be reached, in units of the field.
         jumps: (K, nv) changes of all positions, at the joint by (1).
     """
 
-    dofs: Places
-    fields: tuple[str, ...]
-    columns: Places
+    outputs: tuple[tuple[str, int], ...]
     sizes: Array
     jumps: Array
 
@@ -54,7 +46,7 @@ def stiff_force_limits(model: Any) -> ForceLimits:
 
     kinds = mujoco.mjtIntegrator
     implicit = (int(kinds.mjINT_IMPLICIT), int(kinds.mjINT_IMPLICITFAST))
-    rows: list[tuple[int, str, int, float, float]] = []
+    rows: list[tuple[int, tuple[str, int], float, float]] = []
     gains = np.zeros(model.nv)
     if model.opt.integrator in implicit:
         for k in range(model.nu):
@@ -66,19 +58,17 @@ def stiff_force_limits(model: Any) -> ForceLimits:
             gains[dof] += gain
             if model.actuator_forcelimited[k] and _is_stiff(model, dof, gain):
                 limit = float(np.abs(model.actuator_forcerange[k]).max())
-                rows.append((dof, LIMIT_FIELDS[0], k, limit, limit * gear))
+                rows.append((dof, ("actuator_force", k), limit, limit * gear))
         for joint in np.flatnonzero(model.jnt_actfrclimited).tolist():
             dof = int(model.jnt_dofadr[joint])
             if _is_stiff(model, dof, float(gains[dof])):
                 limit = float(np.abs(model.jnt_actfrcrange[joint]).max())
-                rows.append((dof, LIMIT_FIELDS[1], dof, limit, limit))
-    dofs = np.array([row[0] for row in rows], dtype=np.intp)
+                rows.append((dof, ("qfrc_actuator", dof), limit, limit))
+    jumps = [_jump(model, dof, force, gains) for dof, *_, force in rows]
     return ForceLimits(
-        dofs,
-        tuple(row[1] for row in rows),
-        np.array([row[2] for row in rows], dtype=np.intp),
-        NEAR * np.array([row[3] for row in rows]),
-        np.array([_jump(model, row[0], row[4], gains) for row in rows]).reshape(-1, model.nv),
+        tuple(output for _, output, *_ in rows),
+        NEAR * np.array([limit for *_, limit, _ in rows]),
+        np.array(jumps).reshape(-1, model.nv),
     )
 
 
@@ -86,13 +76,7 @@ def _jump(model: Any, dof: int, force: float, gains: Array) -> Array:
     """What a step with the force of a servo at its limit adds to all positions (nv,); the servos of
     other joints are not at theirs.
     """
-    import mujoco
-
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    inertia = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, inertia)
-    step, others = model.opt.timestep, gains.copy()
+    inertia, step, others = inertia_matrix(model), model.opt.timestep, gains.copy()
     others[dof] = 0.0
     unit = np.zeros(model.nv)
     unit[dof] = force

@@ -14,7 +14,6 @@ import numpy as np
 from sims.base import Array
 from sims.robot.acting import is_asked, natives
 from sims.robot.floating import Afloat
-from sims.robot.force_limits import LIMIT_FIELDS, ForceLimits
 from sims.robot.forces import LOADED, exerted, is_in_drive, moment_of
 from sims.robot.lanes import Addresses, Bench
 from sims.robot.midway import Places
@@ -177,20 +176,6 @@ class Instants:
             readings.append(self._readings(n))
         return np.concatenate(accelerations), np.concatenate(readings)
 
-    def at_limits(self, limits: ForceLimits) -> Array:
-        """Return (N, K) whether a servo may have reached each force limit, at each instant."""
-        for name in LIMIT_FIELDS:
-            self._bench.batch.bind(name)
-        found = []
-        for n, ids in self._placed({}, self.acting):
-            self._bench.batch.forward(ids)
-            bind = self._bench.batch.bind
-            pairs = zip(limits.fields, limits.columns, strict=True)
-            forces = np.stack([bind(name)[:n, column] for name, column in pairs], axis=1)
-            found.append(np.abs(forces) >= limits.sizes)
-        result: Array = np.concatenate(found)
-        return result
-
     def _readings(self, n: int) -> Array:
         """(n, O) of the lanes, as they are now."""
         bind = self._bench.batch.bind
@@ -312,6 +297,18 @@ class Instants:
             yield
         finally:
             self.numbers = own
+
+    @contextmanager
+    def limited_forces(self) -> Iterator[None]:
+        """Read the forces that the limits of stiff servos limit, in place of the outputs."""
+        own = self._outputs, self._drives
+        self._outputs = self._bench.force_limits.outputs
+        self._drives = np.full(len(self._outputs), -1)
+        self._bind(self._bench)
+        try:
+            yield
+        finally:
+            self._outputs, self._drives = own
 
     def inertias(self) -> Array:
         """(N, E, E) of all that moves at each instant that is looked at."""

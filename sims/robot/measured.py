@@ -136,11 +136,6 @@ class MeasuredLinear(Linear):
         self.knots: Places = np.clip(knots, 0, self._steps)
 
     @property
-    def step_count(self) -> int:
-        """Number of steps, one more than the run takes."""
-        return self._steps + 1
-
-    @property
     def step(self) -> float:
         """Seconds of a step of the simulator."""
         return self._motion.step
@@ -242,10 +237,10 @@ class MeasuredLinear(Linear):
         bench = self._simulator.wide(self._work.acting)
         limits = bench.force_limits
         result = np.zeros((self.knots.size - 1, self._tangent.size))
-        if not limits.dofs.size:
+        if not limits.outputs:
             return result
         with np.errstate(all="ignore"), quiet():
-            reached = self._tangent.at_limits(limits)
+            reached = np.abs(self._tangent.limited_forces) >= limits.sizes
         own = limits.jumps[:, bench.places.velocities]
         for steps, active in self._within():
             result[active, : own.shape[1]] += reached[steps] @ own

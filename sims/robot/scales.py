@@ -10,6 +10,7 @@ import numpy as np
 
 from sims.base import Array
 from sims.robot.floating import Floating
+from sims.robot.inertia_matrix import inertia_matrix
 from sims.robot.model import Robot
 
 POSES = 24
@@ -90,12 +91,6 @@ def coefficient_scales(robot: Robot) -> Scales:
 
 def floating_forces(robot: Robot) -> Array:
     """(F,) of each move of what floats, what it takes to accelerate, in N or N m."""
-    import mujoco
-
-    model = robot.compiled
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    whole = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, whole)
-    result: Array = ACCELERATION * np.diagonal(whole)[Floating.of(robot).velocities]
+    inertias = np.diagonal(inertia_matrix(robot.compiled))
+    result: Array = ACCELERATION * inertias[Floating.of(robot).velocities]
     return result

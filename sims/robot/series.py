@@ -38,6 +38,7 @@ from sims.base import Array
 from sims.robot.coupled import ANY, EFFECT, named
 from sims.robot.coupled import coupled as coupled_robot
 from sims.robot.coupled import places as coupled_places
+from sims.robot.inertia_matrix import inertia_matrix
 from sims.robot.model import Robot, kept_with_robot
 from sims.robot.native import RK4
 from sims.robot.quiet import one_line
@@ -164,13 +165,8 @@ def compile_error(robot: Robot, added: Added) -> str:
 @kept_with_robot
 def _inertias(robot: Robot) -> dict[str, float]:
     """About each joint, in the pose that the file states."""
-    import mujoco
-
-    model = robot.compiled
-    data, whole = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-    mujoco.mj_forward(model, data)
-    mujoco.mj_fullM(model, data, whole)
-    return {j.name: float(whole[j.velocity, j.velocity]) for j in robot.joints if j.single}
+    inertias = np.diagonal(inertia_matrix(robot.compiled)).tolist()
+    return {j.name: inertias[j.velocity] for j in robot.joints if j.single}
 
 
 def is_series(effect: Effect | type[Effect]) -> bool:

@@ -27,7 +27,6 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.base import Array
-from sims.robot.force_limits import ForceLimits
 from sims.robot.forces import is_in_drive
 from sims.robot.instants import Instants
 from sims.robot.lanes import Bench
@@ -302,8 +301,7 @@ class Tangent:
     def defects(self) -> Array:
         """(S, Z) by how much the motion misses the model's step from each of its states."""
         motion, joints = self._motion, self._motion.x.shape[1]
-        with self._at.every_step():
-            base, _ = self._at.reached({}, self._at.acting)
+        base, _ = self._every_step
         result = np.zeros_like(base)
         result[:, :joints] = motion.x[1:] - base[:, :joints]
         result[:, joints : 2 * joints] = motion.v[1:] - base[:, joints : 2 * joints]
@@ -314,10 +312,16 @@ class Tangent:
             result[:, -moves:] = motion.afloat.rate[1:] - base[:, -moves:]
         return result
 
-    def at_limits(self, limits: ForceLimits) -> Array:
-        """Return (S, K) whether a servo may have reached each force limit, in each step."""
-        with self._at.every_step():
-            return self._at.at_limits(limits)
+    @property
+    def limited_forces(self) -> Array:
+        """(S, K) the forces that the limits of stiff servos limit, in each step."""
+        return self._every_step[1]
+
+    @cached_property
+    def _every_step(self) -> tuple[Array, Array]:
+        """States (S, Z) after each step, and the limited forces (S, K)."""
+        with self._at.every_step(), self._at.limited_forces():
+            return self._at.reached({}, self._at.acting)
 
     def _between(self, values: Array) -> Array:
         """(S, k) of values (N, k) at the instants that are looked at, linear from one to the next

@@ -130,7 +130,7 @@ class Moves(Scored):
             theta[self.world.slots[name]] = 0.0
             for part, c in parts.items():
                 theta[self.world.slots[part]] += c
-            self.refit([Start(names, theta, model.fit.states)], race=False)
+            return self.fit_one(Start(names, theta, model.fit.states))
         return self.models[key]
 
     def swap(self, model: Model) -> Model:

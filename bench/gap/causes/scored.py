@@ -176,7 +176,11 @@ class Scored(Models):
         # The last stands behind the others.
         self.scanned.pop(key, None)
         self.scanned[key] = scanned
-        scores = self.scored[key] = scanned.scores
+        self.enter_scores(key, scanned.scores)
+
+    def enter_scores(self, key: frozenset[str], scores: Scores) -> None:
+        """Take the scores about a model, by its effects, into account."""
+        self.scored[key] = scores
         self.tests[key] = scores.p_value
         # Kept from the first scan, so that merits stay comparable when a better base fit turns up.
         if not key and not self.chances:

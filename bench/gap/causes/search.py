@@ -89,7 +89,7 @@ class Search(Moves):
             if larger is None:
                 break
             if larger.merit > best.merit and self.missing(best, larger) <= ALPHA:
-                best = self._corrected(larger)
+                best = self.without_step_errors(larger)
             # Near the noise, or where all that is left may be noise, two steps at once find chance.
             elif self.excess(best) < FAR or self.quiet(best):
                 break
@@ -99,7 +99,7 @@ class Search(Moves):
         self.supported = best
         return best
 
-    def _corrected(self, model: Model) -> Model:
+    def without_step_errors(self, model: Model) -> Model:
         """The model without what the engine's own step leaves of it, where that can be taken out;
         or a simpler one that does as well then.
         """
@@ -175,7 +175,7 @@ class Search(Moves):
             return False
         # What the step leaves of friction, say, would be taken for more that is missing.
         if self.world.linear and self.excess(model) < FAR:
-            model = self._corrected(model)
+            model = self.without_step_errors(model)
         return self.quiet(model) and self.plain(model, ALPHA)
 
     def _turns(self, rivals: Sequence[Model]) -> Sequence[Sequence[Model]]:

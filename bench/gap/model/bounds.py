@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
+
 from bench.gap.model.time_scale import is_instant
 from bench.gap.model.world import World
-from sims.base import Parameter
+from sims.base import Array, Parameter
 from sims.system import Coefficient, Effect, Friction
 
 BEYOND = 20.0
@@ -53,6 +55,12 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
         _within(_bounds(parameter, coefficient, effect, world), coefficient)
         for parameter, coefficient in pairs
     ]
+
+
+def clip_coefficients(world: World, name: str, c: Array) -> Array:
+    """Limit the coefficients (k,) of an effect to the range in which a fit may move them."""
+    limited: Array = np.clip(c, *np.array(coefficient_bounds(world, name)).T)
+    return limited
 
 
 def is_unusual(value: float, low: float, high: float) -> bool:

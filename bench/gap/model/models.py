@@ -203,6 +203,15 @@ class Models:
         watch.check()
         self._report_best()
 
+    def fit_all(self, starts: Sequence[Start]) -> list[Model]:
+        """Fit models from their starts side by side, and return the best fits of their effects."""
+        self.refit(starts, race=False)
+        return [self.models[frozenset(start.effects)] for start in starts]
+
+    def fit_one(self, start: Start) -> Model:
+        """Fit a model from a start, and return the best fit of its effects."""
+        return self.fit_all([start])[0]
+
     def _report_best(self) -> None:
         """Report the model with the highest merit, and the share of the gap that it closes."""
         base = self.models.get(frozenset())

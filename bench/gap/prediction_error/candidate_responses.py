@@ -145,8 +145,7 @@ class FollowedRuns:
         world: World,
         theta: Array,
         noise: Noise,
-        trajectories: Sequence[Trajectory] | None,
-        simulator: RobotSimulator | None = None,
+        trajectories: Sequence[Trajectory] | None = None,
         force: Array | None = None,
         max_linearisations: int = MAX_LINEARISATIONS,
     ) -> FollowedRuns:
@@ -157,7 +156,6 @@ class FollowedRuns:
             theta: (P,) parameters of the model.
             noise: of the sensors.
             trajectories: the motion of each run, if it has been estimated before.
-            simulator: in place of that of the world.
             force: (E,) missing forces with which the fit of the process noise begins.
             max_linearisations: maximum number of them, where the motion is not given.
         """
@@ -171,15 +169,11 @@ class FollowedRuns:
             nearby: Sequence[MeasuredLinear | None] = linear or [None] * len(world.tracks)
             motion: Sequence[Trajectory | None] = trajectories or [None] * len(world.tracks)
             linear = [
-                _linearised(world, theta, noise, run, motion[run], near, simulator)
+                _linearised(world, theta, noise, run, motion[run], near)
                 for run, near in enumerate(nearby)
             ]
-            maps = [one.interval_maps() for one in linear]
-            prior = _prior(world, linear, maps[0].states.shape[1])
-            runs = LinearRuns.stacked(maps, world.observed, prior)
             begin = FIRST_FORCE * typical if force is None else force
-            fitted = _fit_noise(runs, noise, begin, typical)
-            found = cls(world, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
+            found = cls._of_linear(world, theta, noise, linear, begin, typical)
             force, noise, trajectories = found.force, found.noise, found.trajectories
             gain = np.inf if best is None else found.log_likelihood - best.log_likelihood
             # The first one is about the readings alone, which are not a motion.
@@ -204,12 +198,26 @@ class FollowedRuns:
             _linearised(self.world, theta, self.noise, run, motion, near, simulator, is_alike)
             for run, (motion, near) in enumerate(zip(self.trajectories, self.linear, strict=True))
         ]
+        given = self.noise, linear, self.force, self.typical
+        return self._of_linear(self.world, theta, *given)
+
+    @classmethod
+    def _of_linear(
+        cls,
+        world: World,
+        theta: Array,
+        noise: Noise,
+        linear: list[MeasuredLinear],
+        force: Array,
+        typical: Array,
+    ) -> FollowedRuns:
+        """Filter the linearised models of all runs; other arguments as those of `_fit_noise`."""
         maps = [one.interval_maps() for one in linear]
         # An effect may have states of its own.
-        prior = _prior(self.world, linear, maps[0].states.shape[1])
-        runs = LinearRuns.stacked(maps, self.world.observed, prior)
-        fitted = _fit_noise(runs, self.noise, self.force, self.typical)
-        return replace(self, theta=theta, linear=linear, runs=runs, **fitted._asdict())
+        prior = _prior(world, linear, maps[0].states.shape[1])
+        runs = LinearRuns.stacked(maps, world.observed, prior)
+        fitted = _fit_noise(runs, noise, force, typical)
+        return cls(world, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
 
     @classmethod
     def of_model(cls, world: World, theta: Array, noise: Noise) -> FollowedRuns:
@@ -270,6 +278,11 @@ class FollowedRuns:
         """(E,) whether the model lacks a force: the filter needs process noise there."""
         mask: Mask = self.losses_without_force > MIN_LOSS_WITHOUT_FORCE
         return mask
+
+    @property
+    def lacks_force(self) -> bool:
+        """Whether the model lacks a force at any coordinate."""
+        return bool(self.missing_forces.any())
 
     @property
     def joints_by_loss(self) -> list[int]:
@@ -354,38 +367,41 @@ class FollowedRuns:
         """Return the derivatives (R, T, C, 2 D) of the readings by the first positions and
         velocities of D joints, without any feedback of the readings.
         """
-        number, samples, channels = self.runs.residuals.shape
-        size, count = self.runs.prior.size, len(self.world.states)
         joints = len(self.linear[0].trajectory.x[0])
         own = np.concatenate([np.arange(joints), self.linear[0].positions + np.arange(joints)])
-        result = np.zeros((number, samples, channels, count))
-        s = np.zeros((number, size, own.size))
-        s[:, own, np.arange(own.size)] = 1.0
-        with np.errstate(all="ignore"):
-            for i in range(samples):
-                result[:, i, :, : own.size] = self.runs.readings[:, i] @ s
-                if i + 1 < samples:
-                    s = self.runs.states[:, i] @ s
-        result[~(np.abs(result) < LARGEST)] = 0.0
+        begin = np.zeros((len(self.linear), self.runs.prior.size, own.size))
+        begin[:, own, np.arange(own.size)] = 1.0
+        result = np.zeros((*self.runs.residuals.shape, len(self.world.states)))
+        result[..., : own.size] = self._without_gain(begin)
         return result
 
     def sensitivities(self, columns: Columns) -> Array:
         """Return what candidates change about the readings of simulated runs (R, T, C, K), by (1)
         without gain, in units of the probes' coefficients.
         """
-        number, samples, channels, count = columns.readings.shape
-        size = self.runs.prior.size
-        result = np.zeros((number, samples, channels, count))
-        s = np.zeros((number, size, count))
-        a, by = self.runs.states, self.runs.inputs
+        number, _, _, count = columns.readings.shape
+        changes = self._without_gain(np.zeros((number, self.runs.prior.size, count)), columns)
+        with np.errstate(all="ignore"):
+            return changes[..., columns.places] / columns.sizes
+
+    def _without_gain(self, s: Array, columns: Columns | None = None) -> Array:
+        """Carry changes of the first states (R, Z, K), and columns if there are any, through (1)
+        without gain.
+        """
+        runs = self.runs
+        samples = runs.residuals.shape[1]
+        result = np.zeros((*runs.residuals.shape, s.shape[2]))
         with np.errstate(all="ignore"):
             for i in range(samples):
-                result[:, i] = columns.readings[:, i] + self.runs.readings[:, i] @ s
+                result[:, i] = runs.readings[:, i] @ s
+                if columns is not None:
+                    result[:, i] += columns.readings[:, i]
                 if i + 1 < samples:
-                    s = a[:, i] @ s + by[:, i] @ columns.pushed[:, i]
+                    s = runs.states[:, i] @ s
+                    if columns is not None:
+                        s += runs.inputs[:, i] @ columns.pushed[:, i]
         result[~(np.abs(result) < LARGEST)] = 0.0
-        with np.errstate(all="ignore"):
-            return result[..., columns.places] / columns.sizes
+        return result
 
     @property
     def is_sound(self) -> bool:
@@ -518,11 +534,10 @@ def _linearised(
     scenario = world.tracks[run].scenario
     start = world.guess[run, :half], world.guess[run, half:]
     robot = simulator or world.simulator
-    given = trajectory
-    if given is None:
+    if trajectory is None:
         states = measured_states(world, noise.sigma, run)
         return MeasuredLinear(robot, theta, scenario, start, measured=states)
-    return MeasuredLinear(robot, theta, scenario, start, given, None, nearby, is_alike)
+    return MeasuredLinear(robot, theta, scenario, start, trajectory, None, nearby, is_alike)
 
 
 def _prior(world: World, linear: Sequence[MeasuredLinear], size: int) -> Array:

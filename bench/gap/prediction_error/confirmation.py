@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from bench.gap.causes.alternatives import Alternatives
 from bench.gap.causes.name import Finding, Inquiry, closed
 from bench.gap.causes.rules import State, is_unexplained, verdict_of
+from bench.gap.causes.search import Search
 from bench.gap.causes.structure import remains
 from bench.gap.causes.trial import Trial
 from bench.gap.held_out import Validation
@@ -31,12 +32,13 @@ class Confirmation(Inquiry):
     """The questions about a robot's recording, in their order.
 
     Args:
-        search: with the base model entered.
+        search: by prediction errors, with the base model entered.
         held_out: the runs for measuring; None if there are none.
     """
 
-    def __init__(self, search: PredictionErrorSearch, held_out: Validation | None) -> None:
+    def __init__(self, search: Search, held_out: Validation | None) -> None:
         super().__init__(search, held_out)
+        assert isinstance(search, PredictionErrorSearch)
         self._robot = search
 
     def answered(self) -> Finding:

@@ -18,7 +18,7 @@ import numpy as np
 
 from bench.gap.causes.gains import Group
 from bench.gap.prediction_error.candidate_responses import Columns, FollowedRuns
-from bench.gap.prediction_error.selection import Regression, groups_of
+from bench.gap.prediction_error.selection import Regression, columns_of, groups_of
 from sims.base import Array
 
 PASSES = 4
@@ -62,13 +62,12 @@ def shows_step_errors(followed: FollowedRuns) -> bool:
     return regress(followed, followed.columns([])).shows_nuisance([])
 
 
-def identify(followed: FollowedRuns, columns: Columns, most: int = MOST) -> Selected:
+def identify(followed: FollowedRuns, columns: Columns) -> Selected:
     """Select effects, with the process noise fitted again after each selection.
 
     Args:
         followed: the runs, without any effect.
         columns: of the candidates.
-        most: maximum number of effects.
     """
     now, chosen = followed, list[Group]()
     coefficients: list[Array] = []
@@ -77,7 +76,7 @@ def identify(followed: FollowedRuns, columns: Columns, most: int = MOST) -> Sele
     for _ in range(PASSES):
         regression = regress(now, columns, chosen, coefficients, numerics)
         selected = regression.pruned(chosen) if chosen else []
-        selected = regression.select(most, selected)
+        selected = regression.select(MOST, selected)
         _, found = regression.solve(selected)
         numerics = regression.nuisance(selected)
         now = with_effects(followed, columns, selected, found, numerics)
@@ -121,7 +120,7 @@ def regress(
     responses = now.responses(columns)
     number, _, _, count = responses.shape
     nuisance = now.step_error_response()
-    own = np.array([c for group in chosen for c in group.columns], dtype=np.intp)
+    own = columns_of(chosen)
     weights = np.concatenate([*coefficients, np.zeros(0)])
     grams = np.zeros((number, count + 1, count + 1))
     crosses, totals = np.zeros((number, count + 1)), np.zeros(number)

@@ -64,7 +64,7 @@ def identify_base(
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
         world.watch.stage("identifying the base parameters")
-        return FollowedRuns.follow(world, theta, noise, None, force=best.force)
+        return FollowedRuns.follow(world, theta, noise, force=best.force)
 
     places = world.base.tolist()
     limits = [range_around(world, i) for i in places]
@@ -78,14 +78,17 @@ def identify_base(
         if tried.is_sound and not any(ends):
             found.append(tried)
         # The base parameters alone leave no force missing, so friction is not needed.
-        if found and not tried.missing_forces.any():
+        if found and not tried.lacks_force:
             break
     best = max(found, key=lambda one: one.log_likelihood, default=followed)
     if best.log_likelihood - followed.log_likelihood < CLEAR:
         return followed, {}
     values = {i: float(best.theta[i]) for i in places}
-    outside = {i: v for i, v in values.items() if not _is_within(world.parameters[i].bounds, v)}
-    wider = {world.parameters[i].name: range_around(world, i, v) for i, v in outside.items()}
+    wider = {}
+    for i, value in values.items():
+        low, high = world.parameters[i].bounds
+        if not low <= value <= high:
+            wider[world.parameters[i].name] = range_around(world, i, value)
     use_bounds(world, wider)
     theta = followed.theta.copy()
     theta[places] = best.theta[places]
@@ -187,8 +190,3 @@ def _derivative(followed: FollowedRuns, target: Array, place: int, bounds: Bound
     change = target - followed.whitened_innovations(moved)
     derivative: Array = np.nan_to_num(change / (moved[place] - followed.theta[place]))
     return derivative
-
-
-def _is_within(bounds: Bounds, value: float) -> bool:
-    low, high = bounds
-    return low <= value <= high

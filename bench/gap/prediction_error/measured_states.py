@@ -92,22 +92,23 @@ def _tracked(times: Array, readings: list[tuple[Array, Array]]) -> list[Array]:
     span = min(float(times[-1] - times[0]), 1.0)
     prior = np.array([10.0, 10.0 / span, 100.0 / span**2]) * max(float(sizes.max()), 1e-9)
     levels = JERKS.size
+    joints, nothing = np.arange(count), np.zeros((count, samples - 1, 3))
     runs = LinearRuns(
-        np.tile(a, (count * levels, 1, 1, 1)),
-        np.zeros((count * levels, samples - 1, 3)),
-        np.tile(g, (count * levels, 1, 1, 1)),
-        np.zeros((count * levels, samples - 1, 3, 0)),
-        np.repeat(reading, levels, axis=0),
-        np.repeat(residuals, levels, axis=0),
-        np.repeat(recorded, levels, axis=0),
-        prior,
-        np.zeros((count * levels, samples - 1, 3)),
-        np.zeros((count * levels, samples - 1, 3)),
-    )
+        states=np.tile(a, (count, 1, 1, 1)),
+        defects=nothing,
+        forces=np.tile(g, (count, 1, 1, 1)),
+        inputs=np.zeros((count, samples - 1, 3, 0)),
+        readings=reading,
+        residuals=residuals,
+        recorded=recorded,
+        prior=prior,
+        step_errors=nothing,
+        jumps=nothing,
+    ).subset(np.repeat(joints, levels))
     force = (sizes[:, None] * JERKS / span**3).reshape(-1, 1)
     filtered = filter_runs(runs, force, np.ones(2))
     likely = filtered.log_likelihood.reshape(count, levels)
-    chosen = np.argmax(likely, axis=1) + levels * np.arange(count)
+    chosen = np.argmax(likely, axis=1) + levels * joints
     best = runs.subset(chosen)
     smoothed = smooth_runs(best, filtered.subset(chosen), force[chosen])
     found = smoothed.states

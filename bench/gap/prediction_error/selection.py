@@ -115,7 +115,7 @@ class Regression:
         """
         gram = self.gram if gram is None else gram
         cross = self.cross if cross is None else cross
-        columns = np.array([c for group in chosen for c in group.columns], dtype=np.intp)
+        columns = columns_of(chosen)
         positive = np.array([p for group in chosen for p in group.positive], dtype=bool)
         active = np.ones(columns.size, dtype=bool)
         solution = np.zeros(columns.size)
@@ -151,7 +151,7 @@ class Regression:
 
     def gains(self, chosen: Sequence[Group]) -> Array:
         """Return what each group gains beside a set, in twice the log likelihood (n,)."""
-        columns = np.array([c for group in chosen for c in group.columns], dtype=np.intp)
+        columns = columns_of(chosen)
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
         gram, cross, rss = self.gram, self.cross, self.total
         if columns.size:
@@ -176,6 +176,12 @@ class Regression:
                 result[i] = 0.0
         return result
 
+    def net_gains(self, chosen: Sequence[Group] = ()) -> Array:
+        """Return what each group gains beside a set, less its price (n,)."""
+        prices = np.array([self.price(group) for group in self.groups])
+        net: Array = self.gains(chosen) - prices
+        return net
+
     def _held(self, chosen: Sequence[Group]) -> list[str]:
         """Effects of a set, with all that they contain."""
         held = [group.effect for group in chosen]
@@ -190,10 +196,9 @@ class Regression:
         """
         chosen = list(begin)
         while len(chosen) < most:
-            gains = self.gains(chosen)
-            prices = np.array([self.price(group) for group in self.groups])
-            best = int(np.argmax(gains - prices))
-            if gains[best] <= prices[best]:
+            gains = self.net_gains(chosen)
+            best = int(np.argmax(gains))
+            if gains[best] <= 0.0:
                 break
             larger = [*chosen, self.groups[best]]
             if not self.generalises(chosen, larger):
@@ -218,7 +223,7 @@ class Regression:
         """Return the residual sums of squares (R,) of each run, fitted to the others."""
         found = []
         groups = [*chosen, self._nuisance]
-        columns = np.array([c for group in groups for c in group.columns], dtype=np.intp)
+        columns = columns_of(groups)
         for run, total in enumerate(self.totals):
             gram, cross = self.gram - self.grams[run], self.cross - self.crosses[run]
             _, parts = self._solve(groups, gram, cross)
@@ -252,6 +257,11 @@ def _normalised(gram: Array, columns: Places) -> tuple[Array, Array]:
     normal = gram[np.ix_(columns, columns)] / scale / scale[:, None]
     normal[np.diag_indices_from(normal)] += RIDGE
     return normal, scale
+
+
+def columns_of(groups: Sequence[Group]) -> Places:
+    """Return the columns of some groups, one group after another."""
+    return np.array([c for group in groups for c in group.columns], dtype=np.intp)
 
 
 def groups_of(probes: Sequence[Probe]) -> list[Group]:

@@ -29,8 +29,8 @@ Structural Time Series Models and the Kalman Filter, 1989, section 3.4).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -62,6 +62,8 @@ CONVERGED = 0.15
 """Relative change of every standard deviation below which (7) ends."""
 SMALLEST_FORCE = 1e-6
 """Smallest standard deviation of a missing force, as a share of the typical force."""
+STACKED = ("states", "defects", "forces", "inputs", "readings", "step_errors", "jumps")
+"""Arrays of the linear models of single runs that are stacked as they are."""
 
 
 @dataclass(frozen=True)
@@ -94,44 +96,27 @@ class LinearRuns:
 
     def subset(self, chosen: Places) -> LinearRuns:
         """Return some of the runs."""
-        return LinearRuns(
-            self.states[chosen],
-            self.defects[chosen],
-            self.forces[chosen],
-            self.inputs[chosen],
-            self.readings[chosen],
-            self.residuals[chosen],
-            self.recorded[chosen],
-            self.prior,
-            self.step_errors[chosen],
-            self.jumps[chosen],
-        )
+        return self._mapped(lambda values: values[chosen])
 
     def segments(self, length: int) -> LinearRuns:
         """Cut the runs into segments of so many samples, each with the prior of a run."""
         number, samples, _ = self.residuals.shape
         count = -(-samples // length)
 
-        def cut(values: Any, last: bool) -> Any:
-            shape = (number, count * length, *values.shape[2:])
-            padded = np.zeros(shape, dtype=values.dtype)
+        def cut(values: Any) -> Any:
+            padded = np.zeros((number, count * length, *values.shape[2:]), dtype=values.dtype)
             padded[:, : values.shape[1]] = values
             parts = padded.reshape(number * count, length, *values.shape[2:])
-            return parts if last else parts[:, :-1]
+            # A segment has one interval less than samples.
+            return parts if values.shape[1] == samples else parts[:, :-1]
 
-        recorded: Mask = cut(self.recorded, last=True)
-        return LinearRuns(
-            cut(self.states, last=False),
-            cut(self.defects, last=False),
-            cut(self.forces, last=False),
-            cut(self.inputs, last=False),
-            cut(self.readings, last=True),
-            cut(self.residuals, last=True),
-            recorded,
-            self.prior,
-            cut(self.step_errors, last=False),
-            cut(self.jumps, last=False),
-        )
+        return self._mapped(cut)
+
+    def _mapped(self, change: Callable[[Any], Any]) -> LinearRuns:
+        """Return the runs with the arrays of all runs changed."""
+        names = [one.name for one in fields(self) if one.name != "prior"]
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
+        return replace(self, **changed)
 
     @classmethod
     def stacked(cls, maps: Sequence[IntervalMaps], observed: Array, prior: Array) -> LinearRuns:
@@ -142,34 +127,27 @@ class LinearRuns:
             observed: (R, T, C), NaN where nothing was recorded.
             prior: (Z,) standard deviations of the first states.
         """
-        runs, samples, channels = observed.shape
-        size, forces = maps[0].forces.shape[1:]
-        states = np.tile(np.eye(size), (runs, samples - 1, 1, 1))
-        defects = np.zeros((runs, samples - 1, size))
-        by_force = np.zeros((runs, samples - 1, size, forces))
-        inputs = np.zeros((runs, samples - 1, *maps[0].inputs.shape[1:]))
-        readings = np.zeros((runs, samples, channels, size))
+        runs, samples, _ = observed.shape
+        stacked: dict[str, Array] = {}
+        for name in STACKED:
+            parts = [getattr(own, name) for own in maps]
+            length = samples if name == "readings" else samples - 1
+            values = np.zeros((runs, length, *parts[0].shape[1:]))
+            if name == "states":
+                values[:] = np.eye(prior.size)
+            for run, part in enumerate(parts):
+                values[run, : len(part)] = part
+            # A step from where the model explodes tells nothing of the next one.
+            values[~(np.abs(values) < LARGEST)] = 0.0
+            stacked[name] = values
         residuals = np.zeros(observed.shape)
-        errors = np.zeros((runs, samples - 1, size))
-        jumps = np.zeros((runs, samples - 1, size))
         for run, own in enumerate(maps):
             count = len(own.predicted)
-            states[run, : count - 1] = own.states
-            defects[run, : count - 1] = own.defects
-            by_force[run, : count - 1] = own.forces
-            inputs[run, : count - 1] = own.inputs
-            readings[run, :count] = own.readings
-            errors[run, : count - 1] = own.step_errors
-            jumps[run, : count - 1] = own.jumps
             residuals[run, :count] = observed[run, :count] - own.predicted
         recorded = np.isfinite(residuals) & np.isfinite(observed)
         residuals[~recorded] = 0.0
-        readings[~recorded] = 0.0
-        # A step from where the model explodes tells nothing of the next one.
-        for values in (states, defects, by_force, inputs, readings, errors, jumps):
-            values[~(np.abs(values) < LARGEST)] = 0.0
-        stacked = states, defects, by_force, inputs, readings, residuals, recorded
-        return cls(*stacked, prior, errors, jumps)
+        stacked["readings"][~recorded] = 0.0
+        return cls(residuals=residuals, recorded=recorded, prior=prior, **stacked)
 
 
 @dataclass(frozen=True)
@@ -194,14 +172,7 @@ class Filtered:
 
     def subset(self, chosen: Places) -> Filtered:
         """Return some of the runs."""
-        return Filtered(
-            self.predicted[chosen],
-            self.covariances[chosen],
-            self.innovations[chosen],
-            self.gains[chosen],
-            self.whiteners[chosen],
-            self.log_likelihood[chosen],
-        )
+        return Filtered(*(getattr(self, one.name)[chosen] for one in fields(self)))
 
     @property
     def whitened(self) -> Array:

@@ -46,7 +46,7 @@ def test_the_jump_is_that_of_a_step_on_either_side_of_the_limit(where):
 @pytest.mark.parametrize("settings", [{"integrator": "Euler"}, {"kv": 0.5}])
 def test_other_servos_have_none(settings):
     model = servo(**settings)
-    assert stiff_force_limits(model).dofs.size == 0
+    assert stiff_force_limits(model).sizes.size == 0
     measured = moved(model, 1.0001) - moved(model, 0.9999)
     assert abs(measured) < 0.1 * STEP**2 * LIMIT / INERTIA
 

@@ -32,7 +32,7 @@ def test_an_effect_is_taken_that_has_merit_and_is_no_chance(monkeypatch, merit, 
     made = search(
         monkeypatch, plain=lambda self, best, doubt: best is not BASE, missing=chance,
         _larger=lambda self, best, size: larger, excess=0.1, quiet=False,
-        _corrected=lambda self, model: model,
+        without_step_errors=lambda self, model: model,
     )  # fmt: skip
     assert made.run() is (larger if taken else BASE)
 
@@ -49,7 +49,7 @@ def test_where_nothing_suggests_an_effect_none_is_tried(monkeypatch):
         return LARGER
 
     asked = {"plain": plain, "_larger": grown, "missing": 0.0, "excess": 0.1, "quiet": False}
-    asked["_corrected"] = lambda self, model: model
+    asked["without_step_errors"] = lambda self, model: model
     assert search(monkeypatch, **asked).run() is LARGER
     assert (doubts, sizes) == ([0.1, 0.015], [1]), "a second effect needs stronger evidence"
 

@@ -1,0 +1,135 @@
+"""Dry friction of a selection, and its form.
+
+The force of dry friction is not linear in its limit where a joint sticks or creeps. So it is fitted
+alone before other effects are, and filters compare whether it has MuJoCo's soft form.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.gap.causes.rules import SWITCH
+from bench.gap.friction_form import (
+    has_dry_friction,
+    is_likelier_soft,
+    with_plain_friction,
+)
+from bench.gap.model.models import Model
+from bench.gap.model.problem import Start
+from bench.gap.prediction_error.identification import Selected
+from bench.gap.prediction_error.search_context import SearchContext
+from bench.gap.prediction_error.selected_sets import without_surplus
+from bench.gap.prediction_error.simulated_fits import fit, is_explained, without_idle_effects
+from sims.robot.native import FIELDS
+
+
+class SoftFrictionError(Exception):
+    """Dry friction of these data has MuJoCo's soft form: search with a simulator of that form.
+
+    Attributes:
+        start: the model whose filter says so; None where simulation does.
+        is_preliminary: whether filters alone say so, before anything was fitted.
+    """
+
+    def __init__(self, start: Start | None = None, is_preliminary: bool = False) -> None:
+        super().__init__()
+        self.start, self.is_preliminary = start, is_preliminary
+
+
+def check_selection(context: SearchContext, selected: Selected) -> None:
+    """Compare a selection with soft dry friction, before anything is fitted.
+
+    Raises:
+        SoftFrictionError: that is likelier than the selection.
+    """
+    filters = context.filters
+    if filters.is_soft or not filters.base.lacks_force:
+        return
+    kept = without_surplus(context, selected)
+    own = filters.log_likelihood(context.columns.start(kept.groups, kept.coefficients).theta)
+    check_filter(context, own, is_preliminary=True)
+
+
+def check_filter(
+    context: SearchContext, log_likelihood: float, is_preliminary: bool = False
+) -> None:
+    """Compare the log likelihood of a filter with that of soft dry friction.
+
+    Args:
+        context: of the search.
+        log_likelihood: of the filter.
+        is_preliminary: whether nothing has been fitted yet.
+
+    Raises:
+        SoftFrictionError: that is likelier.
+    """
+    soft = context.filters.soft_friction
+    if soft is None:
+        return
+    softer = context.filters.log_likelihood(soft.theta, is_soft=True)
+    if softer > log_likelihood + 0.5 * SWITCH:
+        raise SoftFrictionError(soft, is_preliminary)
+
+
+def check_fit(context: SearchContext, model: Model) -> None:
+    """Compare a fitted model with the same effects in the soft form of dry friction.
+
+    Raises:
+        SoftFrictionError: that is likelier.
+    """
+    if is_likelier_soft(context.search, model, SWITCH):
+        raise SoftFrictionError
+
+
+def fit_dry_friction(context: SearchContext, selected: Selected) -> Model:
+    """Fit the dry friction of a selection alone.
+
+    Return the base model where no force is missing in addition to the selection, or where it has no
+    friction.
+    """
+    friction = dry_friction_of(context, selected)
+    if not friction.effects or not selected.followed.lacks_force:
+        return context.search.base
+    found = fit(context, friction)
+    return without_idle_effects(context, found) if is_explained(context, found) else found
+
+
+def dry_friction_of(context: SearchContext, selected: Selected) -> Start:
+    """Return the model of the dry friction of a selection without a state, and nothing else of it;
+    a family in place of its members.
+    """
+    world, filters = context.world, context.filters
+    start = context.columns.start(selected.groups, selected.coefficients)
+    plain, own = with_plain_friction(world, start.effects, start.theta)
+    native = [name for name in plain if name.partition("@")[0] in FIELDS]
+    friction = [name for name in native if has_dry_friction(world, [name])]
+    contained = {part for name in friction for part in world.effects[name].contains}
+    names = tuple(name for name in friction if name not in contained)
+    theta = filters.reference.copy()
+    for name in names:
+        theta[world.slots[name]] = own[world.slots[name]]
+    return Start(names, theta, filters.first_states(filters.base))
+
+
+def stands_alone(context: SearchContext, selected: Selected, friction: Model) -> bool:
+    """Whether dry friction without a state follows the data as well as what was selected.
+
+    Args:
+        context: of the search.
+        selected: the selection.
+        friction: its dry friction, fitted alone.
+
+    Raises:
+        SoftFrictionError: the friction has MuJoCo's soft form.
+    """
+    filters = context.filters
+    start = context.columns.start(selected.groups, selected.coefficients)
+    _, plain = with_plain_friction(context.world, start.effects, start.theta)
+    stiff = filters.log_likelihood(plain)
+    soft = -np.inf if filters.is_soft else filters.log_likelihood(plain, is_soft=True)
+    own = -np.inf if np.array_equal(plain, start.theta) else filters.log_likelihood(start.theta)
+    if not max(stiff, soft) > own - 0.5 * SWITCH:
+        return False
+    if soft > max(stiff, own) + 0.5 * SWITCH:
+        check_fit(context, friction)
+    return True

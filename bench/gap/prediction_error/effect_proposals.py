@@ -1,0 +1,141 @@
+"""Propose effects that a model may lack: those that gain most by regression, and those of the
+standard joint model at the joint where most is missing.
+
+A regression may miss the latter: they are not linear where a joint sticks, where a servo is stiff
+for a light joint, and where an encoder's offset changes the pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bench.gap.causes.nominate import with_effect
+from bench.gap.model.bounds import coefficient_bounds
+from bench.gap.model.problem import Start
+from bench.gap.prediction_error.candidate_responses import FollowedRuns
+from bench.gap.prediction_error.joint_effects import (
+    JOINT_MODEL,
+    SERVO_MODEL,
+    joint_name,
+    offset_from_command,
+    servo_input,
+)
+from bench.gap.prediction_error.library_columns import LibraryColumns, regression_about
+from bench.gap.prediction_error.likelihood_fit import gauss_newton_step
+from bench.gap.prediction_error.model_filters import FilteredSet, ModelFilters
+from sims.base import Array
+from sims.robot.scales import scales
+from sims.robot.simulator import RobotSimulator
+
+MAX_REGRESSION_PROPOSALS = 4
+"""Maximum number of effects that are proposed by regression."""
+MAX_JOINT_PROPOSALS = 3
+"""Maximum number of effects of the joint and servo models that are added to a set."""
+MIN_GAIN_SHARE = 0.3
+"""Share of the largest gain by regression that an effect must have to be proposed."""
+FIRST_SHARE = 0.1
+"""Initial coefficient as a share of the stated friction or of the typical force."""
+
+Proposals = list[tuple[str, Array]]
+"""Names of effects, each with its first coefficients (k,)."""
+
+
+@dataclass
+class EffectProposals:
+    """The proposals of a search.
+
+    Attributes:
+        filters: the filters of the search.
+        columns: the columns of the search.
+
+    Those for the base model are kept, by the number of columns of the library.
+    """
+
+    filters: ModelFilters
+    columns: LibraryColumns
+    _for_base: dict[int, tuple[Proposals, Proposals]] = field(default_factory=dict)
+
+    def of(self, current: FilteredSet, most: int = MAX_JOINT_PROPOSALS) -> list[Start]:
+        """Return models with one more effect than a set.
+
+        Args:
+            current: the set.
+            most: maximum number of effects of the joint and servo models.
+        """
+        world, count = self.filters.world, len(self.columns.library.probes)
+        proposed = self._propose(current) if current.names else self._for_base.get(count)
+        if proposed is None:
+            proposed = self._for_base[count] = self._propose(current)
+        first, joint_model = proposed
+        own = Start(current.names, current.followed.theta, world.guess)
+        return [with_effect(world, own, name, c) for name, c in first + joint_model[:most]]
+
+    def _propose(self, current: FilteredSet) -> tuple[Proposals, Proposals]:
+        """Return all proposals, those of the joint and servo models apart."""
+        found = self._by_regression(current)
+        others, joint = {*current.names, *dict(found)}, current.followed.joints_by_loss[0]
+        joint_model = self._joint_model(current.followed, joint, others)
+        return found + self._offset_and_friction(joint, others), joint_model
+
+    def _by_regression(self, current: FilteredSet) -> Proposals:
+        """Return the effects that gain most by regression, each with its coefficients."""
+        regression, _ = regression_about(current, self.columns.library, current.followed)
+        gains = regression.net_gains()
+        found: dict[str, Array] = {}
+        for i in np.argsort(-gains, kind="stable").tolist():
+            group = regression.groups[i]
+            if group.effect in (*current.names, *found):
+                continue
+            too_little = gains[i] < max(MIN_GAIN_SHARE * gains.max(), 0.0)
+            if len(found) == MAX_REGRESSION_PROPOSALS or too_little:
+                break
+            solution = regression.solve([group])[1][0]
+            found[group.effect] = self.columns.coefficients(group, solution)
+        return list(found.items())
+
+    def _offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:
+        """Return the offset of a joint's encoder, and less dry friction than the model file states,
+        which a derivative by more friction does not tell.
+        """
+        world, place = self.filters.world, joint_name(self.filters.world, joint)
+        found = {f"sensor.bias@q.{place}": offset_from_command(world, self.filters.noise, joint)}
+        friction = f"friction.coulomb@{place}"
+        if friction in world.library:
+            found[friction] = FIRST_SHARE * min(coefficient_bounds(world, friction)[0][0], 0.0)
+        return [
+            (name, np.array([c]))
+            for name, c in found.items()
+            if c and name in world.library and name not in excluded
+        ]
+
+    def _joint_model(
+        self, followed: FollowedRuns, joint: int, excluded: Collection[str]
+    ) -> Proposals:
+        """Return viscous and dry friction and armature of a joint, and stiffness and damping of its
+        servo, those first by which the likelihood gains most.
+        """
+        world, place = self.filters.world, joint_name(self.filters.world, joint)
+        assert isinstance(world.simulator, RobotSimulator)
+        speed = max(float(np.abs(one.trajectory.v[:, joint]).max()) for one in followed.linear)
+        typical = {
+            f"drag.linear@{place}": FIRST_SHARE * float(followed.typical[joint]) / max(speed, 1e-9),
+            f"inertia.armature@{place}": float(scales(world.simulator.robot).inertia[joint]),
+        }
+        effects = [f"{effect}@{place}" for effect in JOINT_MODEL]
+        servo = servo_input(world, joint).removeprefix("u.")
+        effects += [f"{effect}@{servo}" for effect in SERVO_MODEL]
+        found = []
+        for name in effects:
+            if name in world.library and name not in excluded:
+                places, bounds = world.places(name), coefficient_bounds(world, name)
+                step, gain = gauss_newton_step(followed, places, bounds)
+                change = float(step[places[0]])
+                # Where much process noise hides an effect, its typical size is tried.
+                if not gain > 0.5 * self.filters.penalty(name):
+                    change = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
+                found.append((gain, name, np.array([change])))
+        found.sort(key=lambda one: -one[0])
+        return [(name, c) for _, name, c in found]

@@ -1,0 +1,189 @@
+"""Columns of the regressions: what effects of the library, forces of any shape and effects that are
+in the model already add to the states and readings of a filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.gap.causes.candidates import Probe, first_probes
+from bench.gap.causes.gains import Group
+from bench.gap.causes.joint_hats import JointHat
+from bench.gap.causes.structure import hat_probes
+from bench.gap.model.bounds import clip_coefficients, coefficient_bounds
+from bench.gap.model.models import Model
+from bench.gap.model.problem import Known, Start
+from bench.gap.model.world import World
+from bench.gap.prediction_error.candidate_responses import Columns, FollowedRuns
+from bench.gap.prediction_error.identification import Selected, identify, regress
+from bench.gap.prediction_error.joint_effects import has_many_shapes
+from bench.gap.prediction_error.model_filters import FilteredSet, ModelFilters
+from bench.gap.prediction_error.selection import Regression
+from sims.base import Array
+
+RELATIVE_DIFFERENCE = 0.02
+"""Share of a coefficient by which it is moved for its derivative."""
+
+
+class ModelRegression(NamedTuple):
+    """A regression with effects in the model.
+
+    Attributes:
+        regression: of the innovations on the candidates.
+        own: by name of each effect in the model, its columns, which are in every set; the first is
+            the whole change that it makes.
+    """
+
+    regression: Regression
+    own: dict[str, list[int]]
+
+
+@dataclass
+class LibraryColumns:
+    """The columns of a search, about the motion that the base model's filter smooths.
+
+    Attributes:
+        filters: the filters of the search.
+    """
+
+    filters: ModelFilters
+    _library: Columns | None = None
+    _hats: Columns | None = None
+    _regressions: dict[bytes, ModelRegression] = field(default_factory=dict)
+
+    @property
+    def library(self) -> Columns:
+        """Candidates of the library: effects with few shapes, and those that were added."""
+        if self._library is None:
+            world = self.filters.world
+            names = [name for name in world.library if not has_many_shapes(name)]
+            world.watch.stage(f"testing {len(names)} effects", 1)
+            self._library = self.filters.base.columns(self.probes(names))
+        return self._library
+
+    @property
+    def hats(self) -> Columns:
+        """Forces of any shape as candidates, by the labels of their families."""
+        if self._hats is None:
+            probes, _ = hat_probes(self.filters.world)
+            named = [replace(probe, effect=JointHat.name) for probe in probes]
+            self._hats = replace(self.filters.base.columns(named), probes=tuple(probes))
+        return self._hats
+
+    def take_over(self, other: LibraryColumns) -> None:
+        """Use the columns of another search of the same runs."""
+        self._library, self._hats = other._library, other._hats
+
+    def add(self, names: Sequence[str]) -> None:
+        """Add effects to the candidates of the library."""
+        self._library = self.library.joined(self.filters.base.columns(self.probes(names)))
+
+    def probes(self, names: Sequence[str]) -> list[Probe]:
+        """Return the probes of effects about the base model."""
+        base, world, found = self.filters.models.base, self.filters.world, list[Probe]()
+        for name in names:
+            bounds = coefficient_bounds(world, name)
+            for probe in first_probes(world, base.fit, name):
+                # What the model file states may be too much.
+                signed = probe.signed or (bounds[probe.place][0] < 0 and not probe.fixed)
+                found.append(replace(probe, signed=signed))
+        return found
+
+    def select(self) -> Selected:
+        """Select effects of the library by regression."""
+        library = self.library
+        self.filters.world.watch.stage("selecting effects", 1)
+        selected = identify(self.filters.base, library)
+        self.filters.numerics = selected.numerics
+        return selected
+
+    def start(self, groups: Sequence[Group], coefficients: Sequence[Array]) -> Start:
+        """Return the model of a set of groups of columns, from which its fit begins."""
+        theta, base = self.filters.reference.copy(), self.filters.models.base
+        for group, own in zip(groups, coefficients, strict=True):
+            theta[self.filters.world.slots[group.effect]] = self.coefficients(group, own)
+        return Start(tuple(group.effect for group in groups), theta, base.fit.states)
+
+    def coefficients(self, group: Group, solution: Array) -> Array:
+        """Return the coefficients (k,) of an effect that a group of columns with a solution of the
+        regression means.
+        """
+        probes = self.library.probes
+        c = probes[group.columns[0]].c.copy()
+        for column, value in zip(group.columns, solution, strict=True):
+            # A fixed change is that of this very size.
+            if not probes[column].fixed:
+                c[probes[column].place] = value
+        return clip_coefficients(self.filters.world, group.effect, c)
+
+    def regression(self, model: Model) -> ModelRegression:
+        """Return the regression with a fitted model's effects in the model; candidates are the
+        library and forces of any shape.
+        """
+        key = model.fit.theta.tobytes()
+        if key not in self._regressions:
+            current = FilteredSet(self.filters.of_model(model), model.names)
+            columns = self.library.joined(self.hats)
+            self._regressions[key] = regression_about(current, columns, self.filters.base)
+        return self._regressions[key]
+
+    def sensitivities(self, start: Start) -> Known:
+        """Return the derivatives of the runs by the coefficients of a model's effects about the
+        measured motion, as differences of responses.
+        """
+        world, followed = self.filters.world, self.filters.base
+        tangents = [_tangents(world, name, start.theta) for name in start.effects]
+        columns = followed.columns([probe for own in tangents for probe in own])
+        responses = followed.sensitivities(columns)
+        places, derivatives, first = list[int](), [], 0
+        for name, (whole, *moved) in zip(start.effects, tangents, strict=True):
+            for k, probe in enumerate(moved):
+                # A coefficient without a range has no derivative.
+                step = float(probe.c[k] - whole.c[k]) or np.inf
+                change = responses[..., first + 1 + k] - responses[..., first]
+                derivatives.append(change / step)
+            places += world.places(name)
+            first += 1 + len(moved)
+        return Known(np.array(places, dtype=np.intp), np.stack(derivatives, axis=-1))
+
+
+def regression_about(
+    current: FilteredSet, columns: Columns, followed: FollowedRuns
+) -> ModelRegression:
+    """Set up the regression with effects in the model.
+
+    Args:
+        current: the runs as a filter with these effects follows them.
+        columns: of the candidates.
+        followed: the runs as that filter follows them about whose motion the effects act.
+    """
+    own: dict[str, list[int]] = {}
+    probes: list[Probe] = []
+    count = len(columns.probes)
+    for name in current.names:
+        tangents = _tangents(followed.world, name, current.followed.theta)
+        first = count + len(probes)
+        own[name] = list(range(first, first + len(tangents)))
+        probes += tangents
+    joined = columns.joined(followed.columns(probes)) if probes else columns
+    always = range(count, len(joined.probes))
+    return ModelRegression(regress(current.followed, joined, always=always), own)
+
+
+def _tangents(world: World, name: str, theta: Array) -> list[Probe]:
+    """Return the change that an effect makes with its coefficients in a model, and those with each
+    of them moved a little.
+    """
+    c = theta[world.slots[name]]
+    probes = [Probe(name, 0, 0, c, signed=True, fixed=True)]
+    for place, (low, high) in enumerate(coefficient_bounds(world, name)):
+        moved = c.copy()
+        size = max(abs(float(c[place])), RELATIVE_DIFFERENCE * (high - low))
+        step = RELATIVE_DIFFERENCE * size
+        moved[place] += step if moved[place] + step <= high else -step
+        probes.append(Probe(name, 1 + place, place, moved, signed=True, fixed=True))
+    return probes

@@ -1,0 +1,195 @@
+"""Kalman filters that follow the runs with effects in the model.
+
+Regression is linear about the base model; a filter with an effect in its model is not. With the
+right effects it needs no process noise, so that its likelihood compares sets of effects before any
+of them is simulated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.gap.causes.scored import Scored
+from bench.gap.friction_form import has_soft_form, soft_kind
+from bench.gap.model.bounds import clip_coefficients, coefficient_bounds
+from bench.gap.model.models import Model
+from bench.gap.model.problem import Start
+from bench.gap.prediction_error.candidate_responses import FollowedRuns
+from bench.gap.prediction_error.joint_effects import OFFSET_THRESHOLD, joint_name
+from bench.gap.prediction_error.likelihood_fit import maximise_likelihood
+from sims.base import Array
+from sims.robot.simulator import RobotSimulator
+
+RELINEARISATION_THRESHOLD = 100.0
+"""The model is linearised again where the smoothed motion has moved by so many times the noise."""
+MAX_CACHED_FILTERS = 6
+"""Number of filters that are kept for effects that were tried."""
+GAUSS_NEWTON_STEPS = 2
+"""Maximum number of Gauss-Newton steps for an effect that is tried in the model."""
+SOFT_FACTORS = (0.5, 0.8, 1.2, 1.8)
+"""Multiples of the missing force that are tried as dry friction in the soft form."""
+
+
+class FilteredSet(NamedTuple):
+    """A set of effects in the model: the runs as a filter with it follows them, and the names."""
+
+    followed: FollowedRuns
+    names: tuple[str, ...]
+
+
+@dataclass
+class ModelFilters:
+    """The filters of a search.
+
+    Attributes:
+        models: the base model and the fitted ones.
+        numerics: share of the errors of the integrator's steps that the selection has in the model.
+    """
+
+    models: Scored
+    numerics: float = 0.0
+    _of_models: dict[bytes, FollowedRuns] = field(default_factory=dict)
+    _of_sets: dict[frozenset[str], FollowedRuns] = field(default_factory=dict)
+    _of_tried: dict[bytes, FollowedRuns] = field(default_factory=dict)
+    _likelihoods: dict[tuple[bytes, bool], float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.world, self.noise = self.models.world, self.models.noise
+
+    @cached_property
+    def reference(self) -> Array:
+        """(P,) parameters without any effect: those of the base model, with free numbers as they
+        are identified beside effects. A base model without these may need absurd numbers.
+        """
+        theta: Array = self.models.base.fit.theta.copy()
+        identified = self.world.identified
+        if identified is not None:
+            kept = [i not in self.models.frozen for i in self.world.base.tolist()]
+            theta[self.world.base[kept]] = identified[kept]
+        return theta
+
+    def theta_with(self, name: str, c: Array) -> Array:
+        """Return parameters (P,) with one effect, by its coefficients (k,)."""
+        theta = self.reference.copy()
+        theta[self.world.slots[name]] = c
+        return theta
+
+    @property
+    def base(self) -> FollowedRuns:
+        """The runs as a filter follows them with the base model."""
+        return FollowedRuns.of_model(self.world, self.reference, self.noise)
+
+    @property
+    def empty_set(self) -> FilteredSet:
+        """The base model as a set of effects."""
+        return FilteredSet(self.base, ())
+
+    def of_model(self, model: Model) -> FollowedRuns:
+        """Return the runs as a filter follows them with a fitted model."""
+        if not model.names:
+            return self.base
+        key = model.fit.theta.tobytes()
+        if key not in self._of_models:
+            names = frozenset(model.names)
+            known = self._of_sets.get(names)
+            found = (known or self.base).with_parameters(model.fit.theta)
+            if known is None:
+                found = found.with_parameters(model.fit.theta, is_alike=True)
+            self._of_sets[names] = found
+            if self.numerics:
+                defects = found.runs.defects - self.numerics * found.runs.step_errors
+                found = found.refitted(replace(found.runs, defects=defects))
+            self._of_models[key] = found
+        return self._of_models[key]
+
+    def log_likelihood(self, theta: Array, is_soft: bool = False) -> float:
+        """Return the log likelihood of the innovations of a model.
+
+        Args:
+            theta: (P,) its parameters.
+            is_soft: whether effects add dry friction in MuJoCo's soft form, whatever the form of
+                the search.
+        """
+        key = theta.tobytes(), is_soft
+        if key not in self._likelihoods:
+            simulator = self._soft_simulator if is_soft else None
+            self._likelihoods[key] = self.base.with_parameters(theta, simulator).log_likelihood
+        return self._likelihoods[key]
+
+    def with_effects(
+        self, theta: Array, names: Sequence[str], steps: int = GAUSS_NEWTON_STEPS
+    ) -> FilteredSet:
+        """Follow the runs with effects in the model, whose coefficients Gauss-Newton steps improve.
+
+        Args:
+            theta: (P,) initial parameters.
+            names: the effects.
+            steps: maximum number of Gauss-Newton steps.
+        """
+        begin = self._of_tried.get(theta.tobytes()) or self._follow_near(theta, self.base)
+        bounds = [b for name in names for b in coefficient_bounds(self.world, name)]
+        places = [place for name in names for place in self.world.places(name)]
+        best = maximise_likelihood(begin, places, bounds, steps, self._follow_near)
+        newest = list(self._of_tried.items())[:MAX_CACHED_FILTERS]
+        self._of_tried = {best.theta.tobytes(): best, **dict(newest)}
+        return FilteredSet(best, tuple(names))
+
+    def _follow_near(self, theta: Array, known: FollowedRuns) -> FollowedRuns:
+        """Follow the runs with other parameters, about a motion that is known."""
+        followed = known.with_parameters(theta)
+        moved = np.abs(followed.smoothed.states[:, :, : followed.linear[0].positions])
+        # With an encoder offset the true motion is far from the readings.
+        far = moved.max() > RELINEARISATION_THRESHOLD * float(np.nanmax(self.noise.sigma))
+        return followed.with_parameters(theta) if far else followed
+
+    def first_states(self, followed: FollowedRuns) -> Array:
+        """Return states at the first samples (R, s): of the readings, with smoothed positions
+        where an encoder is off. States of the base fit are biased by what is missing.
+        """
+        states, positions = self.world.guess.copy(), followed.first_positions()
+        own = states[:, : positions.shape[1]]
+        noise = float(np.nanmax(self.noise.sigma))
+        moved = np.abs(positions - own) > OFFSET_THRESHOLD * noise
+        fine = np.isfinite(positions) & moved & ~self.world.known[:, : positions.shape[1]]
+        states[:, : positions.shape[1]] = np.where(fine, positions, own)
+        return states
+
+    def penalty(self, name: str) -> float:
+        """Return what an effect must gain in twice the log likelihood."""
+        count = len(self.world.places(name))
+        return float(count * self.models.price + 2.0 * np.log(len(self.world.library)))
+
+    @property
+    def is_soft(self) -> bool:
+        """Whether effects add dry friction in MuJoCo's soft form."""
+        return has_soft_form(self.world)
+
+    @cached_property
+    def soft_friction(self) -> Start | None:
+        """The likeliest model of dry friction in MuJoCo's soft form at the joint where most is
+        missing, by filters; None where the library has none.
+        """
+        followed = self.base
+        joint = followed.joints_by_loss[0]
+        name = f"friction.coulomb@{joint_name(self.world, joint)}"
+        if self.is_soft or name not in self.world.library:
+            return None
+        starts = []
+        for factor in SOFT_FACTORS:
+            # A joint that slides lacks about the force of its friction.
+            size = np.array([factor * float(followed.force[joint])])
+            theta = self.theta_with(name, clip_coefficients(self.world, name, size))
+            starts.append(Start((name,), theta, self.first_states(followed)))
+        return max(starts, key=lambda start: self.log_likelihood(start.theta, is_soft=True))
+
+    @cached_property
+    def _soft_simulator(self) -> RobotSimulator:
+        """The simulator with dry friction in MuJoCo's soft form."""
+        simulator = self.world.simulator_of(soft_kind(self.world.kind))
+        assert isinstance(simulator, RobotSimulator)
+        return simulator

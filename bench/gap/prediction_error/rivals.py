@@ -1,0 +1,183 @@
+"""Sets of effects that do nearly as well as the best one, fitted by simulation: they may be
+equivalent to it, or better.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.gap.model.fit import Fitter
+from bench.gap.model.models import STEPS, Model
+from bench.gap.model.problem import Start
+from bench.gap.prediction_error.forward_selection import (
+    LINEARISATION_ERROR,
+    RIVAL_MARGIN,
+    try_one_more,
+)
+from bench.gap.prediction_error.joint_effects import (
+    JOINT_MODEL,
+    SERVO_MODEL,
+    at_coupled_joints,
+    has_series,
+    plain_effects_beside,
+)
+from bench.gap.prediction_error.model_filters import GAUSS_NEWTON_STEPS
+from bench.gap.prediction_error.search_context import SearchContext
+from bench.gap.prediction_error.simulated_fits import (
+    fit_filtered,
+    higher_merit,
+    in_place_of,
+    is_explained,
+)
+from bench.gap.prediction_error.single_effects import MAX_IMPROVED_SIZE, refine_single_effects
+from sims.base import Array
+
+MAX_RIVALS = 5
+"""Maximum number of rivals of each effect that are fitted by simulation."""
+ALIKE_SHARE = 0.5
+"""Share of an effect's gain by regression that another one at the same joint must have to be
+followed in its place.
+"""
+
+
+class _Rival(NamedTuple):
+    """An effect that may take the place of another one.
+
+    Attributes:
+        effect: its name.
+        c: (k,) its coefficients by the regression.
+        behind: by how much twice the log likelihood is lower with it.
+    """
+
+    effect: str
+    c: Array
+    behind: float
+
+
+def fit_single_in_place(context: SearchContext, best: Model) -> Model:
+    """Return the model with one effect in place of several, where that does as well: two linear
+    laws may imitate one that is not linear.
+    """
+    explained = len(best.names) > 1 and is_explained(context, best)
+    if not explained or has_series(context.world, best.names) or context.world.watch.left():
+        return best
+    filters = context.filters
+    tried = try_one_more(context, filters.empty_set)
+    if not tried:
+        return best
+    (name,) = tried[0].names
+    penalty = sum(filters.penalty(one) for one in best.names) - filters.penalty(name)
+    loss = filters.of_model(best).log_likelihood - tried[0].followed.log_likelihood
+    if 2.0 * loss > penalty + RIVAL_MARGIN:
+        return best
+    return higher_merit(fit_rivals(context, fit_filtered(context, tried[0])), best)
+
+
+def fit_rivals(context: SearchContext, best: Model) -> Model:
+    """Fit the sets that do nearly as well by the regression, and return the best of all."""
+    search, world = context.search, context.world
+    lost = not best.names or not np.isfinite(best.fit.cost)
+    if lost or has_series(world, best.names):
+        return best
+    starts = []
+    for name in best.names:
+        for rival in _find_rivals(context, best, name):
+            start = in_place_of(world, best, [name], rival.effect, rival.c)
+            if frozenset(start.effects) in search.models:
+                continue
+            near = _confirm_by_filter(context, best, rival, start)
+            starts += [near] if near is not None else []
+    if starts:
+        search.refit(starts, race=False)
+    size = len(best.names)
+    if size == 1 and context.filters.base.runs.jumps.any():
+        # Fits at force limits are caught.
+        known = [m for m in search.models.values() if len(m.names) == 1 and m is not best]
+        laws = JOINT_MODEL + SERVO_MODEL
+        plain = [model for model in known if model.names[0].partition("@")[0] in laws]
+        refine_single_effects(context, plain)
+    _fit_at_coupled_joints(context, size)
+    _refine_near(context, size)
+    likeliest = search.best(size)
+    return best if likeliest is None else likeliest
+
+
+def _find_rivals(context: SearchContext, model: Model, name: str) -> list[_Rival]:
+    """Return the effects that do nearly as well by the regression in the place of one."""
+    world = context.world
+    regression, columns = context.columns.regression(model)
+    rest = regression.instead_of(columns[name])
+    # What has more coefficients gains more by chance.
+    gains = rest.net_gains()
+    own = rest.gain_of(columns[name]) - context.filters.penalty(name)
+    same_joint = plain_effects_beside(world, name)
+    found, near_count = dict[str, _Rival](), 0
+    for i in np.argsort(-gains, kind="stable").tolist():
+        group = rest.groups[i]
+        effect, behind = group.effect, own - float(gains[i])
+        if effect not in world.library or effect in (*model.names, *found):
+            continue
+        is_near = behind <= RIVAL_MARGIN + LINEARISATION_ERROR * own and near_count < MAX_RIVALS
+        # Regression is inaccurate for a large effect, so effects at the same joint are tried.
+        is_alike = effect in same_joint and gains[i] > ALIKE_SHARE * own
+        # A law that contains this one never replaces it.
+        if (is_near or is_alike) and name not in world.effects[effect].contains:
+            near_count += is_near
+            c = context.columns.coefficients(group, rest.solve([group])[1][0])
+            found[effect] = _Rival(effect, c, behind)
+    return list(found.values())
+
+
+def _confirm_by_filter(
+    context: SearchContext, best: Model, rival: _Rival, start: Start
+) -> Start | None:
+    """Return a model with a rival in it, by a filter where it is far behind by the regression,
+    which is linear; None where the filter is far behind, too.
+    """
+    if rival.behind <= RIVAL_MARGIN:
+        return start
+    filters = context.filters
+    few = len(context.world.places(rival.effect)) <= MAX_IMPROVED_SIZE
+    steps = GAUSS_NEWTON_STEPS if few else 0
+    followed, names = filters.with_effects(start.theta, start.effects, steps)
+    loss = filters.of_model(best).log_likelihood - followed.log_likelihood
+    return None if 2.0 * loss > RIVAL_MARGIN else Start(names, followed.theta, start.states)
+
+
+def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
+    """Fit the best models of a size with each effect at the other joints of its loop."""
+    search, world = context.search, context.world
+    starts: dict[frozenset[str], Start] = {}
+    for model in _near_the_best(context, size):
+        for name in model.names:
+            c = model.fit.theta[world.slots[name]]
+            for other in at_coupled_joints(world, name):
+                start = in_place_of(world, model, [name], other, c)
+                key = frozenset(start.effects)
+                if other not in model.names and key not in search.models:
+                    starts[key] = start
+    if starts:
+        search.refit(list(starts.values()), race=False)
+
+
+def _refine_near(context: SearchContext, size: int) -> None:
+    """Fit the models of a size whose merit is near the best until nothing is left to gain, so that
+    incomplete fits do not decide between them.
+    """
+    search, near = context.search, _near_the_best(context, size)
+    if context.world.watch.left() or len(near) < 2:
+        return
+    fitter = Fitter(context.world, search.noise, search.frozen, exact=True)
+    starts = [model.fit.start() for model in near]
+    for model, fit in zip(near, fitter.fit(starts, STEPS), strict=True):
+        if fit.cost < model.fit.cost:
+            search.enter(fit)
+
+
+def _near_the_best(context: SearchContext, size: int) -> list[Model]:
+    """Return the models with a number of effects whose merit is near that of the best of them."""
+    of_size = [m for m in context.search.models.values() if len(m.names) == size]
+    highest = max((model.merit for model in of_size), default=-np.inf)
+    return [model for model in of_size if model.merit > highest - RIVAL_MARGIN]

@@ -1,0 +1,40 @@
+"""What the steps of a search by prediction errors share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from bench.gap.causes.search import Search
+from bench.gap.model.world import World
+from bench.gap.prediction_error.effect_proposals import EffectProposals
+from bench.gap.prediction_error.library_columns import LibraryColumns
+from bench.gap.prediction_error.model_filters import ModelFilters
+
+
+@dataclass(frozen=True)
+class SearchContext:
+    """The state of a search.
+
+    Attributes:
+        search: with the models that have been fitted by simulation.
+        filters: filters with effects in the model.
+        columns: columns of regressions.
+        proposals: effects that a set may lack.
+    """
+
+    search: Search
+    filters: ModelFilters
+    columns: LibraryColumns
+    proposals: EffectProposals
+
+    @classmethod
+    def of(cls, search: Search) -> SearchContext:
+        """Return the context of a search that begins."""
+        filters = ModelFilters(search)
+        columns = LibraryColumns(filters)
+        return cls(search, filters, columns, EffectProposals(filters, columns))
+
+    @property
+    def world(self) -> World:
+        """The runs for fitting."""
+        return self.search.world

@@ -1,0 +1,103 @@
+"""Fit the sets that regression selects, and select again with effects of many shapes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bench.gap.model.models import Model
+from bench.gap.prediction_error.identification import Selected
+from bench.gap.prediction_error.joint_effects import acts_at, has_many_shapes
+from bench.gap.prediction_error.search_context import SearchContext
+from bench.gap.prediction_error.simulated_fits import fit, higher_merit, without_idle_effects
+from sims.base import Array
+from sims.robot.forces import OVER_TIME
+from sims.robot.native import FIELDS
+from sims.system import members_of
+
+MAX_SURPLUS = 2
+"""Number of selected effects that may gain too little one after another before the rest of a
+selection is left out.
+"""
+MAX_SLOW_EFFECTS = 2
+"""Sets of at most so many effects are fitted by simulation even where that is slow."""
+LEAST_SHARE = 0.01
+"""Share of the gain of a set by which each further effect must raise it. A model of a real robot is
+never complete, and long recordings show that with certainty.
+"""
+
+
+def fit_quick_selection(context: SearchContext, selected: Selected) -> Model:
+    """Fit the selected set by simulation, without effects that gain little.
+
+    Return the base model where that is slow and a force is missing all the same.
+    """
+    kept = without_surplus(context, selected)
+    slow = len(kept.groups) > MAX_SLOW_EFFECTS and _is_slow(context, kept)
+    if slow and selected.followed.lacks_force:
+        return context.search.base
+    return fit_selection(context, kept)
+
+
+def fit_selection(context: SearchContext, selected: Selected) -> Model:
+    """Fit the selected set by simulation, and leave out effects that do not pay there."""
+    base = context.search.base
+    if not selected.groups:
+        return base
+    start = context.columns.start(selected.groups, selected.coefficients)
+    states = context.filters.first_states(selected.followed)
+    found = fit(context, replace(start, states=states))
+    if not np.isfinite(found.fit.cost):
+        return base
+    found = without_idle_effects(context, found)
+    if selected.shows_steps:
+        found = context.search.without_step_errors(found)
+    return higher_merit(found, base)
+
+
+def without_surplus(context: SearchContext, selected: Selected) -> Selected:
+    """Leave out the last effects of a selection that gain little when a filter has the set in the
+    model: far from the base model a regression is wrong.
+    """
+    filters = context.filters
+    own = filters.log_likelihood(filters.reference)
+    best, kept, gained = 0.0, 0, 0.0
+    found: list[Array] = []
+    for count in range(1, len(selected.groups) + 1):
+        if count > kept + MAX_SURPLUS:
+            break
+        groups = selected.groups[:count]
+        coefficients = selected.regression.solve(groups)[1]
+        theta = context.columns.start(groups, coefficients).theta
+        gain = 2.0 * (filters.log_likelihood(theta) - own)
+        penalty = sum(filters.penalty(group.effect) for group in groups)
+        least = LEAST_SHARE * max(gained, 0.0) * (count - kept)
+        if gain - penalty > best and gain - gained > least:
+            best, kept, gained, found = gain - penalty, count, gain, coefficients
+    return replace(selected, groups=selected.groups[:kept], coefficients=found)
+
+
+def _is_slow(context: SearchContext, selected: Selected) -> bool:
+    """Whether a set is slow to simulate: some forces are computed in every step, or have states of
+    their own.
+    """
+    effects = [context.world.effects[name] for name in selected.effects]
+    return any(
+        member.of not in FIELDS
+        and member.hook in ("force", "hidden")
+        and member.of not in OVER_TIME
+        for effect in effects
+        for member in members_of(effect)
+    )
+
+
+def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
+    """Select again with effects of many shapes, at the joints where a force is missing."""
+    world, joints = context.world, np.flatnonzero(selected.followed.missing_forces).tolist()
+    rich = [n for n in world.library if has_many_shapes(n) and acts_at(world, n, joints)]
+    if not rich:
+        return selected
+    world.watch.stage(f"testing {len(rich)} effects with many shapes", 1)
+    context.columns.add(rich)
+    return context.columns.select()

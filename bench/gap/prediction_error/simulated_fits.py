@@ -1,0 +1,158 @@
+"""Fit sets of effects to whole simulated runs, and judge whether they explain these.
+
+The cost of a fit is not smooth where joints stick and where servos are at force limits, so that a
+fit may be caught. It begins again from coefficients nearby.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bench.gap.causes.rules import SWITCH
+from bench.gap.friction_form import has_dry_friction
+from bench.gap.model.base_fit import costs_of_starts
+from bench.gap.model.models import Model
+from bench.gap.model.problem import Start
+from bench.gap.model.tangents import begun
+from bench.gap.model.world import World
+from bench.gap.prediction_error.model_filters import FilteredSet
+from bench.gap.prediction_error.search_context import SearchContext
+from sims.base import Array
+from sims.system import members_of
+
+NEARBY = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)
+"""Factors of a coefficient at which a fit looks for a lower cost nearby."""
+EXPLAINED_EXCESS = 0.03
+"""Excess over the noise below which a fitted set explains the data."""
+NEARLY_EXPLAINED = 0.1
+"""Share of the base model's excess over the noise below which effects are only added."""
+NEGLIGIBLE, NEGLIGIBLE_SHARE = 0.1, 0.005
+"""Excess over the noise, and share of that of the base model, below which the search ends."""
+
+
+def fit(context: SearchContext, start: Start) -> Model:
+    """Fit a set by simulation; where that leaves much, again with derivatives by the first states
+    about the simulated motion, since those about the measured one may not hold.
+    """
+    search, world = context.search, context.world
+    found = search.fit_one(start)
+    if is_explained(context, found) or not np.isfinite(found.fit.cost):
+        return found
+    before = world.derivatives
+    begun(world, found.fit.theta, found.fit.states, anew=True)
+    found = search.fit_one(found.fit.start())
+    if not is_explained(context, found):
+        # Derivatives about a wrong motion hold for no other model.
+        world.derivatives = before
+    for name in found.names:
+        if has_dry_friction(world, [name]) and not is_explained(context, found):
+            found = fit_nearby(context, found, name)
+    return found
+
+
+def fit_filtered(context: SearchContext, current: FilteredSet) -> Model:
+    """Fit a set by simulation, from the coefficients in its filter."""
+    states = context.filters.first_states(current.followed)
+    return fit(context, Start(current.names, current.followed.theta, states))
+
+
+def fit_nearby(context: SearchContext, model: Model, name: str) -> Model:
+    """Fit a model again from the best of some coefficients of an effect nearby."""
+    ((cost, start),) = lowest_of_each(context, starts_nearby(context, model, name))
+    return context.search.fit_one(start) if cost < model.fit.cost else model
+
+
+def starts_nearby(context: SearchContext, model: Model, name: str) -> list[Start]:
+    """Return starts with coefficients of an effect nearby. The runs begin where the fit has them
+    begin, or where they are measured to begin.
+    """
+    measured = context.filters.first_states(context.filters.base)
+    starts = []
+    for place in context.world.places(name):
+        for factor in NEARBY:
+            theta = model.fit.theta.copy()
+            theta[place] *= factor
+            starts += [Start(model.names, theta, own) for own in (model.fit.states, measured)]
+    return starts
+
+
+def lowest_of_each(context: SearchContext, starts: Sequence[Start]) -> list[tuple[float, Start]]:
+    """Simulate starts, and return that of lowest cost of each set of effects with its cost, the
+    lowest first.
+    """
+    if not starts:
+        return []
+    costs = costs_of_starts(context.world, context.search.noise, starts, share=1.0, lost=np.inf)
+    lowest: dict[tuple[str, ...], tuple[float, Start]] = {}
+    for i in np.argsort(costs, kind="stable").tolist():
+        lowest.setdefault(starts[i].effects, (float(costs[i]), starts[i]))
+    return list(lowest.values())
+
+
+def is_explained(context: SearchContext, model: Model) -> bool:
+    """Whether a fitted model leaves no more than noise, or next to nothing of a large gap."""
+    if is_at_noise(context, model):
+        return True
+    # Friction of the other form leaves a small residual.
+    if has_dry_friction(context.world, model.names) and not context.filters.is_soft:
+        return False
+    excess = context.search.excess
+    return excess(model) < min(NEGLIGIBLE, NEGLIGIBLE_SHARE * excess(context.search.base))
+
+
+def is_at_noise(context: SearchContext, model: Model) -> bool:
+    """Whether a fitted model leaves no more than noise."""
+    return context.search.quiet(model) and context.search.excess(model) < EXPLAINED_EXCESS
+
+
+def is_nearly_explained(context: SearchContext, model: Model) -> bool:
+    """Whether a model closes most of the gap."""
+    excess = context.search.excess
+    return excess(model) < NEARLY_EXPLAINED * excess(context.search.base)
+
+
+def higher_merit(one: Model, other: Model) -> Model:
+    """Return the model of higher merit; the first one of equals."""
+    return max(one, other, key=lambda model: model.merit)
+
+
+def without_idle_effects(context: SearchContext, model: Model) -> Model:
+    """Remove effects that do not pay, and replace a family by a member that does as well."""
+    model = _merge_into_families(context, context.search.drop(model))
+    families = any(name.endswith("@*") for name in model.names)
+    return context.search.plainer(model) if families else model
+
+
+def _merge_into_families(context: SearchContext, model: Model) -> Model:
+    """Replace all members of a family by the family, which needs fewer decisions."""
+    world = context.world
+    for family in (name for name in world.library if name.endswith("@*")):
+        members = [member.name for member in members_of(world.effects[family])]
+        if len(members) < 2 or not set(members) <= set(model.names):
+            continue
+        own = np.concatenate([model.fit.theta[world.slots[name]] for name in members])
+        if own.size != len(world.places(family)):
+            continue
+        fitted = context.search.fit_one(in_place_of(world, model, members, family, own))
+        model = fitted if fitted.merit > model.merit - SWITCH else model
+    return model
+
+
+def in_place_of(world: World, model: Model, names: Sequence[str], other: str, c: Array) -> Start:
+    """Return a model with one effect in the place of some, from which its fit begins.
+
+    Args:
+        world: the runs.
+        model: the fitted model.
+        names: effects that are removed.
+        other: the effect that replaces them.
+        c: (k,) its coefficients.
+    """
+    theta = model.fit.theta.copy()
+    for name in names:
+        theta[world.slots[name]] = 0.0
+    theta[world.slots[other]] = c
+    rest = (name for name in model.names if name not in names)
+    return Start((*rest, other), theta, model.fit.states)
