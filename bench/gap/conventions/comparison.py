@@ -41,7 +41,7 @@ from bench.gap.model.problem import Fit
 from bench.gap.model.world import World
 from bench.gap.prediction_error.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
 from bench.gap.prediction_error.identification import identify
-from bench.gap.prediction_error.search import MANY_SHAPES
+from bench.gap.prediction_error.joint_effects import MANY_SHAPES
 from bench.gap.unit_check import Subject
 from sims.base import Array
 from sims.recording.recording import Recording, Run
