@@ -48,6 +48,7 @@ from bench.gap.unit_check import Subject, recognised, wrong_units
 from bench.gap.verdict import RecordingFault
 from bench.pages.text import joined
 from bench.problem.seeds import rng_for
+from bench.recordings.filter_start import leave_out_settling
 from bench.recordings.joined import load_all
 from bench.recordings.pieces import cut
 from bench.recordings.size import check_recording
@@ -234,11 +235,13 @@ class _Explainer:
         for odd in refuse_odd(self.recording, kind, force):
             say(f"{self.path}: {odd}")
         self.recording, thinned = thin(self.recording, kind)
+        self.recording, settled = leave_out_settling(self.recording, kind)
         self.recording, note = cut(self.recording, kind, subject.pieces, subject.whole)
         recorded = self.recording.runs[0].channels
         names = [channel.name for channel in kind.channels if channel.name in recorded]
         self.recording, quiet = add_least_noise(self.recording, names)
-        self.notes = tuple(text for text in (thinned, note, _added_noise(quiet)) if text)
+        said = thinned, settled, note, _added_noise(quiet)
+        self.notes = tuple(text for text in said if text)
         for note in self.notes:
             say(note)
         check_recording(self.recording, kind(engine=self.engine), force)

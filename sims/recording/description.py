@@ -240,6 +240,7 @@ def check_description(path: Path, meta: Mapping[str, Any], declared: Declared) -
     title = text(path, "title", meta.get("title", path.stem))
     _refuse_poses(path, meta, declared)
     channels = _columns(path, "channel", meta, declared.channels)
+    _refuse_inputs(path, meta, declared)
     inputs = _columns(path, "input", meta, declared.inputs)
     if not channels:
         raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
@@ -292,9 +293,21 @@ def _system(path: Path, meta: Mapping[str, Any]) -> str:
 
 def afloat(declared: Declared) -> Mapping[str, str]:
     """Units of the states of what floats, by name; none of what is no robot."""
-    system = getattr(declared, "system", declared)
-    units: Mapping[str, str] = getattr(system, "afloat", {})
+    units: Mapping[str, str] = getattr(_system_of(declared), "afloat", {})
     return units
+
+
+def _system_of(declared: Declared) -> object:
+    """The system of a simulator, or the system itself."""
+    return getattr(declared, "system", declared)
+
+
+def _refuse_inputs(path: Path, meta: Mapping[str, Any], declared: Declared) -> None:
+    """Refuse inputs whose effect depends on more than a recording has."""
+    reasons: Mapping[str, str] = getattr(_system_of(declared), "refused_inputs", {})
+    given = dotted(table(path, "inputs", meta.get("inputs", {})), reasons)
+    for name in (name for name in reasons if name in given):
+        raise InputError(f"{path}: input {name}: {reasons[name]}")
 
 
 def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: Declared) -> None:
@@ -429,7 +442,8 @@ def _run(path: Path, name: str, value: Any, declared: Declared) -> RunMarks:
         raise InputError(f"{path}: {where}: constant {twice} stands twice")
     constants |= _constants(path, where, direct, declared)
     _possible(path, where, constants, declared)
-    initial = _numbers(path, f"{where}.initial", own.get("initial", {}), declared.states)
+    states = [*declared.states, *getattr(_system_of(declared), "activations", ())]
+    initial = _numbers(path, f"{where}.initial", own.get("initial", {}), states)
     return RunMarks(constants, initial, held_out)
 
 

@@ -61,6 +61,7 @@ class Run:
         fold: number of the cross-validation fold that leaves this run out and predicts it; None
             where no cross-validation is made.
         before: of a part of a run, inputs before it, as in `Scenario`.
+        memory: seconds before a part of this run of which its inputs are kept.
     """
 
     name: str
@@ -76,6 +77,7 @@ class Run:
     log: str = ""
     fold: int | None = None
     before: Mapping[str, Array] = field(default_factory=dict)
+    memory: float = REMEMBERED
 
     def __repr__(self) -> str:
         # A cell of a notebook that ends in a run would print all of its samples.
@@ -108,7 +110,7 @@ class Run:
         earlier = self.before.get(name, np.empty((2, 0)))
         stamps = np.concatenate([earlier[0] + self.times[0], self.times[:row]]) - self.times[row]
         known = np.stack([stamps, np.concatenate([earlier[1], self.inputs[name][:row]])])
-        return known[:, stamps >= -REMEMBERED]
+        return known[:, stamps >= -self.memory]
 
 
 @dataclass(frozen=True, repr=False)

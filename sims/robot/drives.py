@@ -8,6 +8,7 @@ import numpy as np
 
 from sims.base import Array
 from sims.robot.acting import lanes_with, part_of
+from sims.robot.activation_filters import activation_filters
 from sims.robot.coupled import before as joint_before
 from sims.robot.forces import exerted, is_in_drive, moment_of
 from sims.robot.lanes import Bench
@@ -73,7 +74,9 @@ class Shown:
 
         inputs = {name: flat(u) for name, u in given.felt.items()}
         for one in self.robot.actuators:
-            inputs[f"u.{one.name}"] = flat(given.instant[:, :, one.control])
+            # What is behind a filter does not change within a step.
+            if not self._is_filtered(one):
+                inputs[f"u.{one.name}"] = flat(given.instant[:, :, one.control])
         t = np.tile(self.step * np.arange(float(steps)), lanes.size)[:, None]
         drive = shown.reshape(lanes.size * steps, -1)
         carried = np.stack([drive, np.zeros_like(drive)])
@@ -89,7 +92,12 @@ class Shown:
         gear = float(self.robot.compiled.actuator_gear[actuator.id, 0])
         gain: Array = self.bench.fields["actuator_gainprm"][:, actuator.id, 0]
         direct = actuator.kind in ("motor", "position", "velocity")
+        direct = direct and not self._is_filtered(actuator)
         return gear * gain if direct else np.zeros_like(gain)
+
+    def _is_filtered(self, actuator: Actuator) -> bool:
+        """Whether a filter stands before it, so that a control has no effect at once."""
+        return any(one.actuator == actuator for one in activation_filters(self.robot))
 
     def _limits(self, actuator: Actuator) -> tuple[float, float]:
         """Of what it exerts on its joint, as far as the file states them."""

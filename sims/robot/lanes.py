@@ -242,24 +242,10 @@ class Bench:
         result[..., own] = forces
         return result
 
-    def settle(self, controls: Array) -> Array:
-        """Let filters of actuators begin at their first controls (n, nu): they were on before;
-        returns activations (n, na).
-        """
-        import mujoco
-
-        model = self.model
-        n = len(controls)
-        if not model.na:
-            return np.zeros((n, 0))
-        dynamics = mujoco.mjtDyn
-        filters = (int(dynamics.mjDYN_FILTER), int(dynamics.mjDYN_FILTEREXACT))
-        act = self.batch.bind("act")
-        for i in range(model.nu):
-            if int(model.actuator_dyntype[i]) in filters:
-                act[:n, int(model.actuator_actadr[i])] = controls[:, i]
-        begun: Array = act[:n].copy()
-        return begun
+    def activate(self, activations: Array) -> None:
+        """Put the actuators of n lanes at their first activations (n, na)."""
+        if self.model.na:
+            self.batch.bind("act")[: len(activations)] = activations
 
     def run(self, controls: Array, forces: Array, record: Sequence[str]) -> dict[str, Array]:
         """Step n lanes S times.

@@ -271,8 +271,8 @@ class Linear:
         for lane, (number, one, _) in enumerate(rows):
             if one.signal not in numbers:
                 continue
-            series = felt[one.signal][lane] - self._motion.inputs[one.signal]
             column = numbers[one.signal]
+            series = felt[one.signal][lane] - self._motion.controls[:, column]
             at_once = instant[one.signal][lane] - self._motion.instant[:, column]
             change = Change(number, actuator=column, series=series, instant=at_once)
             result.setdefault(number, []).append(change)

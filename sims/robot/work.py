@@ -70,14 +70,16 @@ class Given(NamedTuple):
     Attributes:
         controls: (n, S, nu).
         forces: (n, S, nv) generalised.
-        felt: inputs, (n, S) by name.
+        felt: inputs, (n, S) by name; behind a filter before an actuator, its activation.
         instant: controls as they are when each step begins.
+        activations: (n, na) of actuators when the first step begins.
     """
 
     controls: Array
     forces: Array
     felt: Mapping[str, Array]
     instant: Array
+    activations: Array
 
     @classmethod
     def of(cls, parts: Sequence[Given]) -> Given:
@@ -91,6 +93,7 @@ class Given(NamedTuple):
             np.concatenate([_lasting(part.forces, steps) for part in parts]),
             {n: np.concatenate([_lasting(part.felt[n], steps) for part in parts]) for n in names},
             np.concatenate([_lasting(part.instant, steps) for part in parts]),
+            np.concatenate([part.activations for part in parts]),
         )
 
 
