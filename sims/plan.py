@@ -102,7 +102,8 @@ def make_runs(scenarios: Sequence[Scenario], by_initial: bool = False) -> Runs:
         read = tuple(sorted(scenario.linear)), scenario.offset, earlier
         stated = tuple(sorted(scenario.initial.items())) if by_initial else ()
         told = ((name, u.tobytes()) for name, u in signals)
-        content = scenario.times.tobytes(), read, stated, *told
+        off = tuple((name, mask.tobytes()) for name, mask in sorted(scenario.off.items()))
+        content = scenario.times.tobytes(), read, stated, off, *told
         group = by_content.setdefault(content, len(distinct))
         if group == len(distinct):
             distinct.append(scenario)

@@ -240,7 +240,7 @@ class _Explainer:
         recorded = self.recording.runs[0].channels
         names = [channel.name for channel in kind.channels if channel.name in recorded]
         self.recording, quiet = add_least_noise(self.recording, names)
-        said = thinned, settled, note, _added_noise(quiet)
+        said = *self.recording.notes, thinned, settled, note, _added_noise(quiet)
         self.notes = tuple(text for text in said if text)
         for note in self.notes:
             say(note)

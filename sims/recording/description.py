@@ -11,6 +11,12 @@ from typing import Any, NamedTuple, TypeAlias
 
 from sims.base import Channel, InputError, Simulator
 from sims.files import require_file
+from sims.recording.drive_switches import (
+    DriveSwitch,
+    check_switches,
+    read_switches,
+    without_switches,
+)
 from sims.recording.mapping import Sources, read_sources
 from sims.recording.units import Scale, scale
 from sims.system import System
@@ -76,6 +82,7 @@ class Description:
             a run begins as their first cells say.
         linear: inputs that go straight from one sample to the next.
         sources: where the columns stand.
+        switches: columns that say when drives are on.
     """
 
     system: str
@@ -89,6 +96,7 @@ class Description:
     begins: Mapping[str, Scale]
     linear: frozenset[str]
     sources: Sources
+    switches: tuple[DriveSwitch, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -140,7 +148,7 @@ def model_in(
         if "system" in meta:
             raise InputError(f"{description}: expected system or model, found both; leave one out")
         model = description.parent / text(description, "model", meta["model"])
-    actuators = table(description, "actuators", meta.get("actuators", {}))
+    actuators = without_switches(table(description, "actuators", meta.get("actuators", {})))
     engine = table(description, "engine", meta.get("engine", {}))
     return ModelFile(Path(model), actuators, engine, _free(description, meta))
 
@@ -252,6 +260,13 @@ def check_description(path: Path, meta: Mapping[str, Any], declared: Declared) -
     # A robot has no name of a system: its model file stands for it.
     robotic = declared.has_model
     extra = _extra(path, meta, declared)
+    sources = read_sources(
+        path,
+        meta,
+        {name: column.table for name, column in (*channels.items(), *inputs.items())},
+    )
+    switches = _switches(path, meta, declared, sources)
+    extra = {**{switch.column: "1" for switch in switches}, **extra}
     return Description(
         system=declared.name if robotic else _system(path, meta),
         title=title,
@@ -263,12 +278,20 @@ def check_description(path: Path, meta: Mapping[str, Any], declared: Declared) -
         extra=extra,
         begins=_begins(path, extra, declared),
         linear=frozenset(name for name, column in inputs.items() if _hold(path, name, column)),
-        sources=read_sources(
-            path,
-            meta,
-            {name: column.table for name, column in (*channels.items(), *inputs.items())},
-        ),
+        sources=sources,
+        switches=switches,
     )
+
+
+def _switches(
+    path: Path, meta: Mapping[str, Any], declared: Declared, sources: Sources
+) -> tuple[DriveSwitch, ...]:
+    """The columns that say when drives are on, checked."""
+    switches = read_switches(path, meta)
+    names = [signal.name for signal in (*declared.channels, *declared.inputs)]
+    actuators = [name.removeprefix("u.") for name in names if name.startswith("u.")]
+    check_switches(path, switches, actuators, ["run", "t", *names], sources.stated)
+    return switches
 
 
 def check_names(path: Path, marked: Iterable[str], there: Iterable[str]) -> None:

@@ -153,4 +153,4 @@ def with_history(scenario: Scenario, step: float) -> tuple[Scenario, int] | None
         else:
             begun = float(own[np.flatnonzero(stamps <= first)[-1]])
         inputs[name] = np.concatenate([[begun], own[later], values])
-    return replace(scenario, times=times - first, inputs=inputs, before={}, initial={}), steps
+    return replace(scenario, times=times - first, inputs=inputs, before={}, off={}), steps

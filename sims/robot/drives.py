@@ -14,6 +14,7 @@ from sims.robot.forces import exerted, is_in_drive, moment_of
 from sims.robot.lanes import Bench
 from sims.robot.model import Actuator, Robot
 from sims.robot.native import COUPLING, arm_of
+from sims.robot.switched_off import working_servos
 from sims.robot.system import RobotSystem
 from sims.robot.work import Given
 from sims.system import Acting
@@ -45,6 +46,7 @@ class Shown:
         n = len(readings)
         for actuator in self.robot.actuators:
             apart = given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
+            apart = np.where(given.off[:, :, actuator.id], 0.0, apart)
             if actuator.joint not in bench.drives or not apart.any():
                 continue
             column = readings[:, :, bench.drives[actuator.joint]]
@@ -81,6 +83,9 @@ class Shown:
         drive = shown.reshape(lanes.size * steps, -1)
         carried = np.stack([drive, np.zeros_like(drive)])
         stiffness = np.repeat(bench.stiffness(bench.places)[lanes], steps, axis=0)
+        if given.off.any():
+            on = working_servos(bench.robot, bench.places.velocities, given.off[lanes, :steps])
+            stiffness = stiffness * on.reshape(stiffness.shape)
         moment = moment_of(self.system, t, flat(x), flat(v), inputs, carried, stiffness)
         own = part_of(tuple((e, c) for e, c in acting if is_in_drive(e)), lanes)
         every = tuple((e, np.repeat(c, steps, axis=1)) for e, c in own)

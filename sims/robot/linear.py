@@ -111,6 +111,7 @@ class Linear:
             "forces": self._simulator.wide(self._work.acting).spread(given.forces[0]),
             "instant": given.instant[0],
             "inputs": {name: u[0] for name, u in given.felt.items()},
+            "off": given.off[0],
         }
 
     def _afloat(self, fields: Mapping[str, Array]) -> Afloat:

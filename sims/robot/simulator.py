@@ -41,6 +41,7 @@ from sims.robot.numerics import INTEGRATORS, Numerics, RobotEngine, own_numerics
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
 from sims.robot.series import Added, by_series
+from sims.robot.switched_off import off_steps, working_servos
 from sims.robot.system import RobotSystem, system_of
 from sims.robot.work import Given, Made, Start, Work, by_run, instants
 from sims.simulated import Simulated
@@ -288,7 +289,8 @@ class RobotSimulator(Simulated):
             # Servos follow the activation in place of the command.
             activations = self._activations(one, taken, begun[:, one.address])
             felt = {**felt, f"u.{one.actuator.name}": activations[:, :-1]}
-        return Given(controls, forces, felt, given, begun)
+        off = off_steps(self.robot, work.scenario, self.step, steps)
+        return Given(controls, forces, felt, given, begun, np.broadcast_to(off, (n, *off.shape)))
 
     def _first_activation(self, one: ActivationFilter, work: Work, controls: Array) -> Array:
         """Return the activation (n,) of a filter at the start of a run.
@@ -379,9 +381,16 @@ class RobotSimulator(Simulated):
             stiffness = bench.stiffness(places)[:n]
             asking = Forces(self.robotic, start.acting, given.felt, places, stiffness, self.step)
             forces = bench.spread(given.forces)
-            done = bench.ask(given.controls, forces, compiled(asking) or asking, record)
+            asked_of = None
+            if given.off.any():
+                # Compiled effects take servos for equally stiff in all steps.
+                asking.working = working_servos(bench.robot, places.velocities, given.off)
+            else:
+                asked_of = compiled(asking)
+            done = bench.ask(given.controls, forces, asked_of or asking, record, given.off)
         else:
-            done = bench.run(given.controls, bench.spread(given.forces), record)
+            forces = bench.spread(given.forces)
+            done = bench.run(given.controls, forces, record, given.off)
         x = np.concatenate([start.x[:, None], done["qpos"][:, :, places.positions]], axis=1)
         v = np.concatenate([start.v[:, None], done["qvel"][:, :, places.velocities]], axis=1)
         x[bench.failed] = np.nan
