@@ -56,7 +56,7 @@ from bench.recordings.stamps import refuse_odd
 from bench.recordings.thinning import thin
 from bench.runs.threads import one_thread
 from sims import extended as extend
-from sims.base import Array, InputError
+from sims.base import Array, InputError, Simulator
 from sims.extended import Extended
 from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
@@ -173,6 +173,16 @@ def explain_and_design(
             return Proposed(explanation, explainer.design(seconds, longest))
 
 
+def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
+    """Switch off or leave out what a robot's drives do nothing about."""
+    if not kind.has_model:
+        return recording
+    # Loaded where there is a robot alone.
+    from bench.gap.prediction_error.inactive_drives import without_inactive_drives
+
+    return without_inactive_drives(recording, kind)
+
+
 class _Subject(NamedTuple):
     """What is explained: a recording, what it is taken for if not for what it says, and whether all
     of it is looked at.
@@ -220,7 +230,9 @@ class _Explainer:
         self.seed = seed
         self.tuner = tuner
         self.say = say
-        self.recording, kind = load_all(subject.sources, subject.system, subject.model, free)
+        self.recording, kind = load_all(
+            subject.sources, subject.system, subject.model, free, _without_inactive_drives
+        )
         self.path = self.recording.path
         if not issubclass(kind, Simulated):
             raise self._takes_no_effects()
@@ -240,9 +252,9 @@ class _Explainer:
         recorded = self.recording.runs[0].channels
         names = [channel.name for channel in kind.channels if channel.name in recorded]
         self.recording, quiet = add_least_noise(self.recording, names)
-        said = *self.recording.notes, thinned, settled, note, _added_noise(quiet)
+        said = thinned, settled, note, _added_noise(quiet)
         self.notes = tuple(text for text in said if text)
-        for note in self.notes:
+        for note in (*self.recording.notes, *self.notes):
             say(note)
         check_recording(self.recording, kind(engine=self.engine), force)
         self.watch = watch
@@ -356,7 +368,9 @@ class _Explainer:
         base, search, finding, rng = found
         self.watch.stage("measuring the gain")
         verdict = self.assessor.verdict(search, finding, rng, self.started)
-        verdict = replace(verdict, recording_faults=self.faults)
+        verdict = replace(
+            verdict, recording_faults=self.faults, recording_notes=self.recording.notes
+        )
         if self.coarse is not None:
             verdict = with_numerics(verdict, self.coarse)
         self.found = search, finding

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from bench.pages.text import joined
 from sims.base import Simulator
 from sims.recording.recording import Recording, Run
 
@@ -54,7 +53,7 @@ def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Rec
     if not seconds:
         return recording, ""
     filters = activation_filters(robot.robot)
-    names = joined([one.actuator.name for one in filters])
+    names = ", ".join(one.actuator.name for one in filters)
     note = (
         f"the first {seconds:.3g} s of runs are left out, in which the filters of {names} settle: "
         "their first activations are not recorded (state them if they are known: "

@@ -95,7 +95,7 @@ def test_a_planted_damping_is_found_behind_filtered_servos(tmp_path, begun):
     assert number.value == pytest.approx(change, rel=0.03)
     (line,) = [line for line in lines if "are left out" in line]
     assert "the first 0.4 s" in line
-    assert "s1 and s2" in line
+    assert "the filters of s1, s2 settle" in line
     assert '[runs.NAME.initial] "act.s1"' in line
 
 
