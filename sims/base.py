@@ -181,6 +181,8 @@ class Scenario:
         before: inputs before the run, by name where they are known: instants in seconds from
             ``times[0]``, negative and increasing, and values, (2, K). Else they had their first
             value.
+        off: whether actuators of a robot are switched off, (T,) by name, held from one sample to
+            the next; what is left out is on.
     """
 
     times: Array
@@ -190,6 +192,7 @@ class Scenario:
     linear: frozenset[str] = frozenset()
     offset: float = 0.0
     before: Mapping[str, Array] = field(default_factory=dict)
+    off: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         # Copies that nobody can write to: scenarios are shared by lanes and by methods.
@@ -211,6 +214,12 @@ class Scenario:
             if not (np.diff(stamps, append=0.0) > 0).all():
                 raise InputError(
                     f"input '{name}' before the run: its instants must be negative and increasing"
+                )
+        for name, mask in self.off.items():
+            if mask.shape != times.shape:
+                raise InputError(
+                    f"actuator '{name}' is off in {mask.shape} samples, the scenario has "
+                    f"{times.size}"
                 )
         # The class is frozen; this is how it sets its own fields.
         object.__setattr__(self, "before", before)

@@ -84,8 +84,13 @@ class Runs:
         return rows[self.of]
 
 
-def make_runs(scenarios: Sequence[Scenario]) -> Runs:
-    """Group scenarios (one a lane) with the same times and inputs."""
+def make_runs(scenarios: Sequence[Scenario], by_initial: bool = False) -> Runs:
+    """Group scenarios (one a lane) with the same times and inputs.
+
+    Args:
+        scenarios: of the lanes.
+        by_initial: whether the initial states that they state are to be the same, too.
+    """
     # Told apart by object first: comparing contents costs more than most lanes' share of a step.
     objects, of = by_object(scenarios)
     by_content: dict[object, int] = {}
@@ -95,7 +100,10 @@ def make_runs(scenarios: Sequence[Scenario]) -> Runs:
         signals = sorted(scenario.inputs.items())
         earlier = tuple((name, u.tobytes()) for name, u in sorted(scenario.before.items()))
         read = tuple(sorted(scenario.linear)), scenario.offset, earlier
-        content = scenario.times.tobytes(), read, *((name, u.tobytes()) for name, u in signals)
+        stated = tuple(sorted(scenario.initial.items())) if by_initial else ()
+        told = ((name, u.tobytes()) for name, u in signals)
+        off = tuple((name, mask.tobytes()) for name, mask in sorted(scenario.off.items()))
+        content = scenario.times.tobytes(), read, stated, off, *told
         group = by_content.setdefault(content, len(distinct))
         if group == len(distinct):
             distinct.append(scenario)

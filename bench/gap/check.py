@@ -15,6 +15,7 @@ from bench.gap.model.crew import Crew
 from bench.gap.model.floor import noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
+from bench.recordings.filter_start import leave_out_settling
 from bench.recordings.inspection import load
 from bench.recordings.pieces import cut
 from sims.base import InputError
@@ -44,6 +45,7 @@ def check(
     recording, kind = load(source, system, model, free)
     if not issubclass(kind, Simulated):
         raise InputError(f"{recording.path}: simulator {recording.system} takes no effects")
+    recording, _ = leave_out_settling(recording, kind)
     recording, _ = cut(recording, kind)
     engine = kind.default_engine if kind.own_engine else "batch"
     constants = () if kind.has_model else tuple(free)

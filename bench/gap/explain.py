@@ -48,6 +48,7 @@ from bench.gap.unit_check import Subject, recognised, wrong_units
 from bench.gap.verdict import RecordingFault
 from bench.pages.text import joined
 from bench.problem.seeds import rng_for
+from bench.recordings.filter_start import leave_out_settling
 from bench.recordings.joined import load_all
 from bench.recordings.pieces import cut
 from bench.recordings.size import check_recording
@@ -55,7 +56,7 @@ from bench.recordings.stamps import refuse_odd
 from bench.recordings.thinning import thin
 from bench.runs.threads import one_thread
 from sims import extended as extend
-from sims.base import Array, InputError
+from sims.base import Array, InputError, Simulator
 from sims.extended import Extended
 from sims.recording.description import read_meta
 from sims.recording.recording import Recording, Run
@@ -173,6 +174,16 @@ def explain_and_design(
             return Proposed(explanation, explainer.design(seconds, longest))
 
 
+def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
+    """Switch off or leave out what a robot's drives do nothing about."""
+    if not kind.has_model:
+        return recording
+    # Loaded where there is a robot alone.
+    from bench.gap.prediction_error.inactive_drives import without_inactive_drives
+
+    return without_inactive_drives(recording, kind)
+
+
 class _Subject(NamedTuple):
     """What is explained: a recording, what it is taken for if not for what it says, and whether all
     of it is looked at.
@@ -220,7 +231,9 @@ class _Explainer:
         self.seed = seed
         self.tuner = tuner
         self.say = say
-        self.recording, kind = load_all(subject.sources, subject.system, subject.model, free)
+        self.recording, kind = load_all(
+            subject.sources, subject.system, subject.model, free, _without_inactive_drives
+        )
         self.path = self.recording.path
         if not issubclass(kind, Simulated):
             raise self._takes_no_effects()
@@ -235,12 +248,14 @@ class _Explainer:
         for odd in refuse_odd(self.recording, kind, force):
             say(f"{self.path}: {odd}")
         self.recording, thinned = thin(self.recording, kind)
+        self.recording, settled = leave_out_settling(self.recording, kind)
         self.recording, note = cut(self.recording, kind, subject.pieces, subject.whole)
         recorded = self.recording.runs[0].channels
         names = [channel.name for channel in kind.channels if channel.name in recorded]
         self.recording, quiet = add_least_noise(self.recording, names)
-        self.notes = tuple(text for text in (thinned, note, _added_noise(quiet)) if text)
-        for note in self.notes:
+        said = thinned, settled, note, _added_noise(quiet)
+        self.notes = tuple(text for text in said if text)
+        for note in (*self.recording.notes, *self.notes):
             say(note)
         check_recording(self.recording, kind(engine=self.engine), force)
         self.watch = watch
@@ -356,7 +371,9 @@ class _Explainer:
         base, search, finding, rng = found
         self.watch.stage("measuring the gain")
         verdict = self.assessor.verdict(search, finding, rng, self.started)
-        verdict = replace(verdict, recording_faults=self.faults)
+        verdict = replace(
+            verdict, recording_faults=self.faults, recording_notes=self.recording.notes
+        )
         if self.coarse is not None:
             verdict = with_numerics(verdict, self.coarse)
         self.found = search, finding

@@ -14,6 +14,7 @@ from bench.gap.held_out import HeldOutRuns
 from bench.gap.model.floor import noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
+from bench.recordings.filter_start import leave_out_settling
 from bench.recordings.inspection import refuse_huge
 from bench.recordings.size import check_recording
 from bench.recordings.stamps import refuse_odd
@@ -61,6 +62,7 @@ def scored(
     data = memory or read_recording(path, kind, whole=True)
     # What the recording states of itself stands above what the model was fitted with.
     data = replace(data, constants={**extended.constants, **data.constants})
+    data, _ = leave_out_settling(data, kind)
     runs = data.held_out() if held_out else data.runs
     if not runs:
         raise InputError(f"{path}: no run is marked held_out, and only such runs were to count")

@@ -210,6 +210,8 @@ class Verdict:
         cut: that the search was ended early, and what was not asked; None where it came to its end.
         recording_faults: wrong units or signs of the recording, for which no cause was searched;
             left out where there are none.
+        recording_notes: how samples of the recording were taken, such as those in which drives are
+            off; left out where there is nothing to say.
     """
 
     verdict: VerdictName
@@ -224,6 +226,7 @@ class Verdict:
     seconds: float
     cut: Cut | None = None
     recording_faults: tuple[RecordingFault, ...] = ()
+    recording_notes: tuple[str, ...] = ()
 
     @property
     def says(self) -> str:
@@ -267,6 +270,7 @@ class Verdict:
             "seconds": self.seconds,
             "cut": self.cut.document() if self.cut is not None else None,
             **({"recording_faults": faults} if faults else {}),
+            **({"recording_notes": list(self.recording_notes)} if self.recording_notes else {}),
         }
 
     @classmethod
@@ -289,6 +293,7 @@ class Verdict:
             document["seconds"],
             Cut.of(cut) if cut is not None else None,
             tuple(RecordingFault.of(fault) for fault in document.get("recording_faults", ())),
+            tuple(document.get("recording_notes", ())),
         )
 
     def __repr__(self) -> str:

@@ -77,6 +77,7 @@ def scenario_of(run: Run, simulator: Simulator, constants: Mapping[str, float]) 
         {**constants, **run.constants},
         run.linear,
         run.offset,
+        off=run.off,
     )
 
 

@@ -121,6 +121,7 @@ def summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
         held = "each left out in turn"
     size = f"{_count(whole, 'run')} ({held}), {samples} samples, {seconds:.4g} s"
     yield f"{recording.path}: system {recording.system}, {size}"
+    yield from recording.notes
     yield ""
     yield from _aligned([_RUN_HEAD, *map(_run_row, runs[:_MOST_RUNS])], left=2)
     if len(runs) > _MOST_RUNS:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,8 +18,10 @@ def load_all(
     system: str | None = None,
     model: str | Path | None = None,
     free: Sequence[str] = (),
+    prepared: Callable[[Recording, type[Simulator]], Recording] | None = None,
 ) -> tuple[Recording, type[Simulator]]:
-    """Recordings as one, and the simulator that they are of; arguments as those of `load`.
+    """Recordings as one, and the simulator that they are of; arguments as those of `load`, and
+    what is made of each recording before its runs are divided.
 
     Two or three unmarked runs in all are cross-validated; else each recording holds out what it
     would hold out alone, a run at least. A constant that they state differently is one of their
@@ -29,6 +31,8 @@ def load_all(
         InputError: one cannot be read, or they are not of one system with the same channels.
     """
     loaded = [load(source, system, model, free, divide=False) for source in sources]
+    if prepared is not None:
+        loaded = [(prepared(recording, kind), kind) for recording, kind in loaded]
     first, kind = loaded[0]
     if len(loaded) == 1:
         return divided(first, folds=True), kind
@@ -65,6 +69,7 @@ def load_all(
         constants=constants,
         noise=_noise(recordings),
         runs=tuple(runs),
+        notes=tuple(note for recording in recordings for note in recording.notes),
     )
     return (divided(joined, folds=True) if folds else joined), kind
 

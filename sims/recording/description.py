@@ -11,6 +11,12 @@ from typing import Any, NamedTuple, TypeAlias
 
 from sims.base import Channel, InputError, Simulator
 from sims.files import require_file
+from sims.recording.drive_switches import (
+    DriveSwitch,
+    check_switches,
+    read_switches,
+    without_switches,
+)
 from sims.recording.mapping import Sources, read_sources
 from sims.recording.units import Scale, scale
 from sims.system import System
@@ -76,6 +82,7 @@ class Description:
             a run begins as their first cells say.
         linear: inputs that go straight from one sample to the next.
         sources: where the columns stand.
+        switches: columns that say when drives are on.
     """
 
     system: str
@@ -89,6 +96,7 @@ class Description:
     begins: Mapping[str, Scale]
     linear: frozenset[str]
     sources: Sources
+    switches: tuple[DriveSwitch, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -140,7 +148,7 @@ def model_in(
         if "system" in meta:
             raise InputError(f"{description}: expected system or model, found both; leave one out")
         model = description.parent / text(description, "model", meta["model"])
-    actuators = table(description, "actuators", meta.get("actuators", {}))
+    actuators = without_switches(table(description, "actuators", meta.get("actuators", {})))
     engine = table(description, "engine", meta.get("engine", {}))
     return ModelFile(Path(model), actuators, engine, _free(description, meta))
 
@@ -240,6 +248,7 @@ def check_description(path: Path, meta: Mapping[str, Any], declared: Declared) -
     title = text(path, "title", meta.get("title", path.stem))
     _refuse_poses(path, meta, declared)
     channels = _columns(path, "channel", meta, declared.channels)
+    _refuse_inputs(path, meta, declared)
     inputs = _columns(path, "input", meta, declared.inputs)
     if not channels:
         raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
@@ -251,6 +260,13 @@ def check_description(path: Path, meta: Mapping[str, Any], declared: Declared) -
     # A robot has no name of a system: its model file stands for it.
     robotic = declared.has_model
     extra = _extra(path, meta, declared)
+    sources = read_sources(
+        path,
+        meta,
+        {name: column.table for name, column in (*channels.items(), *inputs.items())},
+    )
+    switches = _switches(path, meta, declared, sources)
+    extra = {**{switch.column: "1" for switch in switches}, **extra}
     return Description(
         system=declared.name if robotic else _system(path, meta),
         title=title,
@@ -262,12 +278,20 @@ def check_description(path: Path, meta: Mapping[str, Any], declared: Declared) -
         extra=extra,
         begins=_begins(path, extra, declared),
         linear=frozenset(name for name, column in inputs.items() if _hold(path, name, column)),
-        sources=read_sources(
-            path,
-            meta,
-            {name: column.table for name, column in (*channels.items(), *inputs.items())},
-        ),
+        sources=sources,
+        switches=switches,
     )
+
+
+def _switches(
+    path: Path, meta: Mapping[str, Any], declared: Declared, sources: Sources
+) -> tuple[DriveSwitch, ...]:
+    """The columns that say when drives are on, checked."""
+    switches = read_switches(path, meta)
+    names = [signal.name for signal in (*declared.channels, *declared.inputs)]
+    actuators = [name.removeprefix("u.") for name in names if name.startswith("u.")]
+    check_switches(path, switches, actuators, ["run", "t", *names], sources.stated)
+    return switches
 
 
 def check_names(path: Path, marked: Iterable[str], there: Iterable[str]) -> None:
@@ -292,9 +316,21 @@ def _system(path: Path, meta: Mapping[str, Any]) -> str:
 
 def afloat(declared: Declared) -> Mapping[str, str]:
     """Units of the states of what floats, by name; none of what is no robot."""
-    system = getattr(declared, "system", declared)
-    units: Mapping[str, str] = getattr(system, "afloat", {})
+    units: Mapping[str, str] = getattr(_system_of(declared), "afloat", {})
     return units
+
+
+def _system_of(declared: Declared) -> object:
+    """The system of a simulator, or the system itself."""
+    return getattr(declared, "system", declared)
+
+
+def _refuse_inputs(path: Path, meta: Mapping[str, Any], declared: Declared) -> None:
+    """Refuse inputs whose effect depends on more than a recording has."""
+    reasons: Mapping[str, str] = getattr(_system_of(declared), "refused_inputs", {})
+    given = dotted(table(path, "inputs", meta.get("inputs", {})), reasons)
+    for name in (name for name in reasons if name in given):
+        raise InputError(f"{path}: input {name}: {reasons[name]}")
 
 
 def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: Declared) -> None:
@@ -429,7 +465,8 @@ def _run(path: Path, name: str, value: Any, declared: Declared) -> RunMarks:
         raise InputError(f"{path}: {where}: constant {twice} stands twice")
     constants |= _constants(path, where, direct, declared)
     _possible(path, where, constants, declared)
-    initial = _numbers(path, f"{where}.initial", own.get("initial", {}), declared.states)
+    states = [*declared.states, *getattr(_system_of(declared), "activations", ())]
+    initial = _numbers(path, f"{where}.initial", own.get("initial", {}), states)
     return RunMarks(constants, initial, held_out)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from sims.base import Array, InputError, similar, unknown
 from sims.limits import is_number
 from sims.recording.description import Declared, Description, afloat, dotted
+from sims.recording.drive_switches import read_switches
 from sims.recording.table import Table, TableRun
 from sims.user_toml import shown, table
 
@@ -90,6 +91,7 @@ def described(
     time = table(path, "time", result.get("time", {}))
     tables = {"channels": channels, "inputs": inputs, "extra": extra, "time": time}
 
+    switches = [switch.column for switch in read_switches(path, result)]
     stamps = _column("t", time)
     taken = {stamps, *extra}
     taken.update(_column(name, own) for name, own in (*channels.items(), *inputs.items()))
@@ -100,6 +102,8 @@ def described(
             inputs[name] = {}
         elif name in poses:
             extra[name] = {}
+        elif name in switches:
+            extra[name] = {"unit": "1"}
         else:
             raise _belongs_to_nothing(path, name, declared)
 

@@ -11,9 +11,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sims.base import Array, InputError, frozen
 from sims.recording.description import (
@@ -27,6 +28,7 @@ from sims.recording.description import (
     read_meta,
     system_of,
 )
+from sims.recording.drive_switches import switched_runs
 from sims.recording.frame import Frame, described, read_frame, with_index
 from sims.recording.mapping import read_logs
 from sims.recording.table import TableRun, read_table
@@ -34,6 +36,9 @@ from sims.recording.units import SAME, Scale
 
 __all__ = ["Declared", "Recording", "Run", "read_recording", "system_of"]
 
+
+Mask = NDArray[np.bool_]
+Number = TypeVar("Number", bound=np.generic)
 
 REMEMBERED = 2.0
 """Seconds before a part of a run of which its inputs are kept: what lags, limits of the rate and
@@ -61,6 +66,8 @@ class Run:
         fold: number of the cross-validation fold that leaves this run out and predicts it; None
             where no cross-validation is made.
         before: of a part of a run, inputs before it, as in `Scenario`.
+        off: whether actuators of a robot are switched off, each (T,), by name.
+        memory: seconds before a part of this run of which its inputs are kept.
     """
 
     name: str
@@ -76,6 +83,8 @@ class Run:
     log: str = ""
     fold: int | None = None
     before: Mapping[str, Array] = field(default_factory=dict)
+    off: Mapping[str, Mask] = field(default_factory=dict)
+    memory: float = REMEMBERED
 
     def __repr__(self) -> str:
         # A cell of a notebook that ends in a run would print all of its samples.
@@ -88,7 +97,7 @@ class Run:
     def part(self, rows: slice, name: str = "") -> Run:
         """Some of its samples as a run; of another name where one is given."""
 
-        def cut(signals: Mapping[str, Array]) -> dict[str, Array]:
+        def cut(signals: Mapping[str, NDArray[Number]]) -> dict[str, NDArray[Number]]:
             return {key: values[rows] for key, values in signals.items()}
 
         return replace(
@@ -100,6 +109,7 @@ class Run:
             # a known initial state is that of the whole run's beginning
             initial={} if rows.start else self.initial,
             extra=cut(self.extra),
+            off=cut(self.off),
             before={name: self._before(name, rows.start or 0) for name in self.inputs},
         )
 
@@ -108,7 +118,7 @@ class Run:
         earlier = self.before.get(name, np.empty((2, 0)))
         stamps = np.concatenate([earlier[0] + self.times[0], self.times[:row]]) - self.times[row]
         known = np.stack([stamps, np.concatenate([earlier[1], self.inputs[name][:row]])])
-        return known[:, stamps >= -REMEMBERED]
+        return known[:, stamps >= -self.memory]
 
 
 @dataclass(frozen=True, repr=False)
@@ -117,7 +127,8 @@ class Recording:
     its runs.
 
     `extra` has the units of the columns that belong to no channel or input, such as pixels of a
-    tracked film; `model` the model file where it is of a robot.
+    tracked film; `model` the model file where it is of a robot; `notes` what is to be said of
+    how it was read, such as samples in which drives are off.
     """
 
     path: Path
@@ -128,6 +139,7 @@ class Recording:
     runs: tuple[Run, ...]
     extra: Mapping[str, str] = field(default_factory=dict)
     model: ModelFile | None = None
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         first = self.runs[0] if self.runs else None
@@ -177,8 +189,8 @@ def read_recording(
         table = table.with_suffix(".csv") if table.suffix == ".toml" else table
         parts = read_table(table, *columns, list(about.extra))
     check_names(description, about.runs, [part.name for part in parts])
-    runs = [_run(table, part, about) for part in parts]
-    kept = tuple(runs) if whole else _split(description, runs, folds)
+    switched = switched_runs(table, [_run(table, part, about) for part in parts], about.switches)
+    kept = switched.runs if whole else _split(description, switched.runs, folds)
     return Recording(
         table,
         about.system,
@@ -188,6 +200,7 @@ def read_recording(
         kept,
         about.extra,
         model_in(description, meta),
+        switched.notes,
     )
 
 
@@ -217,15 +230,17 @@ def recording_of_frame(
     about = check_description(path, stated, declared)
     parts = read_frame(path, whole, about)
     check_names(path, about.runs, [part.name for part in parts])
+    switched = switched_runs(path, [_run(path, part, about) for part in parts], about.switches)
     return Recording(
         path,
         about.system,
         about.title,
         about.constants,
         about.noise,
-        tuple(_run(path, part, about) for part in parts),
+        switched.runs,
         about.extra,
         model_in(path, stated),
+        switched.notes,
     )
 
 

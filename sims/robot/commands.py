@@ -53,8 +53,8 @@ class _Actuator:
 
     @property
     def linear(self) -> bool:
-        """Whether its force is its control times a gain, plus a bias."""
-        return self.single and self.direct and self.fixed and self.steady
+        """Whether its force is its control, perhaps filtered, times a gain, plus a bias."""
+        return self.single and (self.direct or self.filtered) and self.fixed and self.steady
 
     @property
     def steady(self) -> bool:

@@ -8,11 +8,13 @@ import numpy as np
 
 from sims.base import Array
 from sims.robot.acting import lanes_with, part_of
+from sims.robot.activation_filters import activation_filters
 from sims.robot.coupled import before as joint_before
 from sims.robot.forces import exerted, is_in_drive, moment_of
 from sims.robot.lanes import Bench
 from sims.robot.model import Actuator, Robot
 from sims.robot.native import COUPLING, arm_of
+from sims.robot.switched_off import working_servos
 from sims.robot.system import RobotSystem
 from sims.robot.work import Given
 from sims.system import Acting
@@ -44,6 +46,7 @@ class Shown:
         n = len(readings)
         for actuator in self.robot.actuators:
             apart = given.instant[:, :, actuator.control] - given.controls[:, :, actuator.control]
+            apart = np.where(given.off[:, :, actuator.id], 0.0, apart)
             if actuator.joint not in bench.drives or not apart.any():
                 continue
             column = readings[:, :, bench.drives[actuator.joint]]
@@ -73,11 +76,16 @@ class Shown:
 
         inputs = {name: flat(u) for name, u in given.felt.items()}
         for one in self.robot.actuators:
-            inputs[f"u.{one.name}"] = flat(given.instant[:, :, one.control])
+            # What is behind a filter does not change within a step.
+            if not self._is_filtered(one):
+                inputs[f"u.{one.name}"] = flat(given.instant[:, :, one.control])
         t = np.tile(self.step * np.arange(float(steps)), lanes.size)[:, None]
         drive = shown.reshape(lanes.size * steps, -1)
         carried = np.stack([drive, np.zeros_like(drive)])
         stiffness = np.repeat(bench.stiffness(bench.places)[lanes], steps, axis=0)
+        if given.off.any():
+            on = working_servos(bench.robot, bench.places.velocities, given.off[lanes, :steps])
+            stiffness = stiffness * on.reshape(stiffness.shape)
         moment = moment_of(self.system, t, flat(x), flat(v), inputs, carried, stiffness)
         own = part_of(tuple((e, c) for e, c in acting if is_in_drive(e)), lanes)
         every = tuple((e, np.repeat(c, steps, axis=1)) for e, c in own)
@@ -89,7 +97,12 @@ class Shown:
         gear = float(self.robot.compiled.actuator_gear[actuator.id, 0])
         gain: Array = self.bench.fields["actuator_gainprm"][:, actuator.id, 0]
         direct = actuator.kind in ("motor", "position", "velocity")
+        direct = direct and not self._is_filtered(actuator)
         return gear * gain if direct else np.zeros_like(gain)
+
+    def _is_filtered(self, actuator: Actuator) -> bool:
+        """Whether a filter stands before it, so that a control has no effect at once."""
+        return any(one.actuator == actuator for one in activation_filters(self.robot))
 
     def _limits(self, actuator: Actuator) -> tuple[float, float]:
         """Of what it exerts on its joint, as far as the file states them."""

@@ -85,6 +85,8 @@ class Forces:
         forces: the effects that push, with their coefficients (K, L, 1).
         frictions: those that rub.
         hidden: those with states.
+        working: (L, S, D) 0 where a position servo is switched off and 1 elsewhere; None where all
+            are on.
 
     Args:
         system: see above.
@@ -122,6 +124,7 @@ class Forces:
         for loading, c in asked:
             if loading.of in LOADED:
                 self.loaded |= (c != 0).any(axis=0)[:, 0]
+        self.working: Array | None = None
         self._states: list[State] = []
 
     def at(self, k: int, look: Look) -> tuple[Array, Array]:
@@ -152,7 +155,10 @@ class Forces:
         x, v, *sides = motion
         now = np.full((len(x), 1), steps * self.step)
         inputs = {name: u[:, k, None] for name, u in self.felt.items()}
-        return moment_of(self.system, now, x, v, inputs, np.stack(sides), self.stiffness)
+        stiffness = self.stiffness
+        if self.working is not None:
+            stiffness = stiffness * self.working[:, k]
+        return moment_of(self.system, now, x, v, inputs, np.stack(sides), stiffness)
 
 
 def is_in_drive(effect: Effect) -> bool:

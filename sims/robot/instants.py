@@ -21,6 +21,7 @@ from sims.robot.model import Robot
 from sims.robot.moment import RobotMoment
 from sims.robot.native import SOLIMP, stiff
 from sims.robot.remembered import advanced, along
+from sims.robot.switched_off import ForceRanges, Mask, working_servos
 from sims.robot.system import RobotSystem
 from sims.system import Acting, Effect, Force, Friction, Hidden, State
 
@@ -44,6 +45,7 @@ class Motion:
         carried: (2, S, D) what transmissions carry, from either side.
         afloat: (S + 1, P) poses and (S + 1, F) velocities of what floats.
         step: seconds.
+        off: (S, K) which actuators are switched off.
     """
 
     x: Array
@@ -56,6 +58,7 @@ class Motion:
     carried: Array
     afloat: Afloat
     step: float
+    off: Mask
 
     @property
     def rates(self) -> Array:
@@ -113,6 +116,7 @@ class Instants:
         self._asked = [(e, c) for e, c in acting if is_asked(e)]
         bench.load(_repeated(acting, bench.count))
         self._stiffness = bench.stiffness(places)[:1]
+        self._working = working_servos(bench.robot, places.velocities, motion.off)
         self._states = [self.gone(effect, c) for effect, c in self._asked]
         self.remembering = [k for k, (e, _) in enumerate(self._asked) if isinstance(e, Hidden)]
         self._after: dict[int, State] = {}
@@ -209,9 +213,14 @@ class Instants:
             "a": lambda k: bind("act")[:, k],
             "r": lambda k: qvel[:, floating.velocities[k]],
         }
+        ranges: ForceRanges | None = None
+        if motion.off[self.numbers].any():
+            ranges = self._bench.force_ranges()
         for begin in range(0, self.numbers.size, count):
             at = self.numbers[begin : begin + count]
             n = at.size
+            if ranges is not None:
+                ranges.write(motion.off[at])
             batch.state[:] = self._fresh
             qpos[:n, places.positions] = motion.x[at]
             qvel[:n, places.velocities] = motion.v[at]
@@ -247,7 +256,7 @@ class Instants:
             # A servo's drive moves with the state as it does in the simulation.
             self._bench.batch.forward(None if n == self._bench.count else np.arange(n))
             carried = np.stack([bind(name)[:n, places.velocities] for name in SIDES])
-        moment = moment_of(self._system, t, x, v, inputs, carried, self.stiff(n))
+        moment = moment_of(self._system, t, x, v, inputs, carried, self.stiff(at))
         self._exerted = np.zeros_like(x)
         limits: dict[int, Array] = {}
         for k, (effect, c) in enumerate(self._asked):
@@ -271,9 +280,10 @@ class Instants:
         for joint, limit in limits.items():
             self._bench.rub(n, int(places.velocities[joint]), np.maximum(limit, 0.0))
 
-    def stiff(self, count: int) -> Array:
-        """(count, D) of the servos, at so many instants."""
-        return np.repeat(self._stiffness, count, axis=0)
+    def stiff(self, at: Places) -> Array:
+        """(n, D) of the servos, in some steps."""
+        stiffness: Array = self._stiffness * self._working[at]
+        return stiffness
 
     @contextmanager
     def on(self, bench: Bench) -> Iterator[None]:
@@ -339,7 +349,7 @@ class Instants:
         carried[0][:, of[of >= 0]] = read[:, of >= 0]
         inputs = {name: u[at, None] for name, u in motion.inputs.items()}
         t: Array = motion.step * at[:, None].astype(np.float64)
-        x, v, stiff = motion.x[at], motion.v[at], self.stiff(at.size)
+        x, v, stiff = motion.x[at], motion.v[at], self.stiff(at)
         moment = moment_of(self._system, t, x, v, inputs, carried, stiff)
         force = exerted(((effect, np.repeat(c, at.size, axis=1)),), moment)
         result: Array = np.where(of >= 0, force[:, of], 0.0)
@@ -399,7 +409,8 @@ class Instants:
         inputs = {name: u[:, None] for name, u in motion.inputs.items()}
         x = 0.5 * (motion.x[:-1] + motion.x[1:])[:steps]
         v = 0.5 * (motion.v[:-1] + motion.v[1:])[:steps]
-        return moment_of(self._system, t[:, None], x, v, inputs, motion.carried, self.stiff(steps))
+        stiffness = self.stiff(np.arange(steps))
+        return moment_of(self._system, t[:, None], x, v, inputs, motion.carried, stiffness)
 
 
 def friction_damping(robot: Robot, dof: int) -> tuple[float, float]:
@@ -437,6 +448,7 @@ def _looked_at(motion: Motion, every: int) -> tuple[Places, Places]:
     # as smooth as the motion.
     if changes.mean() > 1.0 / every:
         changes[1:] = False
+    changes[1:] |= (motion.off[1:] != motion.off[:-1]).any(axis=1)
     numbers = np.arange(steps)
     begins = np.maximum.accumulate(np.where(changes, numbers, 0))
     looked = (numbers - begins) % every == 0

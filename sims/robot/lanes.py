@@ -25,6 +25,7 @@ from sims.robot.native import COUPLING, FIELDS, lanes_spec, write_friction_form
 from sims.robot.series import FIELDS as SERIES
 from sims.robot.series import WRITTEN, hung, is_series, press
 from sims.robot.series import write as in_series
+from sims.robot.switched_off import FORCE_FIELDS, ForceRanges, constant_stretches
 from sims.system import Acting
 
 LANES = 64
@@ -242,32 +243,21 @@ class Bench:
         result[..., own] = forces
         return result
 
-    def settle(self, controls: Array) -> Array:
-        """Let filters of actuators begin at their first controls (n, nu): they were on before;
-        returns activations (n, na).
-        """
-        import mujoco
+    def activate(self, activations: Array) -> None:
+        """Put the actuators of n lanes at their first activations (n, na)."""
+        if self.model.na:
+            self.batch.bind("act")[: len(activations)] = activations
 
-        model = self.model
-        n = len(controls)
-        if not model.na:
-            return np.zeros((n, 0))
-        dynamics = mujoco.mjtDyn
-        filters = (int(dynamics.mjDYN_FILTER), int(dynamics.mjDYN_FILTEREXACT))
-        act = self.batch.bind("act")
-        for i in range(model.nu):
-            if int(model.actuator_dyntype[i]) in filters:
-                act[:n, int(model.actuator_actadr[i])] = controls[:, i]
-        begun: Array = act[:n].copy()
-        return begun
-
-    def run(self, controls: Array, forces: Array, record: Sequence[str]) -> dict[str, Array]:
+    def run(
+        self, controls: Array, forces: Array, record: Sequence[str], off: Mask | None = None
+    ) -> dict[str, Array]:
         """Step n lanes S times.
 
         Args:
             controls: (n, S, nu).
             forces: (n, S, nv) generalised forces.
             record: fields of MuJoCo's data.
+            off: (n, S, K) which actuators are switched off.
 
         Returns:
             What is recorded, (n, S, ...) by name.
@@ -282,7 +272,7 @@ class Bench:
             given = np.concatenate([controls, forces], axis=2)
         n, steps, _ = controls.shape
         result = self._begun(n, steps, record)
-        for part in self._parts(n, steps):
+        for part in self._switched(n, steps, off):
             done = self.batch.rollout(
                 part.stop - part.start, given[:, part], spec, tuple(record), self._ids(n)
             )
@@ -291,12 +281,32 @@ class Bench:
         self._fails(n)
         return result
 
+    def _switched(self, n: int, steps: int, off: Mask | None) -> Iterator[slice]:
+        """Yield the parts of `_parts` after another, with actuators that are off switched off."""
+        if off is None or not off.any():
+            yield from self._parts(n, steps)
+            return
+        ranges = self.force_ranges()
+        for stretch in constant_stretches(off):
+            ranges.write(off[:, stretch.start])
+            for part in self._parts(n, stretch.stop - stretch.start):
+                yield slice(stretch.start + part.start, stretch.start + part.stop)
+        ranges.restore()
+
+    def force_ranges(self) -> ForceRanges:
+        """Return the force ranges of the lanes, to switch actuators off until they are loaded
+        again.
+        """
+        self._changed.update(FORCE_FIELDS)
+        return ForceRanges(self.fields)
+
     def ask(
         self,
         controls: Array,
         forces: Array,
         asking: Asked,
         record: Sequence[str],
+        off: Mask | None = None,
     ) -> dict[str, Array]:
         """The same where effects are asked for their forces in every step.
 
@@ -305,6 +315,7 @@ class Bench:
             forces: likewise.
             asking: the effects.
             record: likewise.
+            off: likewise.
         """
         n, steps, _ = controls.shape
         dofs = asking.addresses.velocities
@@ -326,9 +337,20 @@ class Bench:
         changes: Mask = np.any(np.diff(controls, axis=1, prepend=controls[:, :1]) != 0, axis=2)
         of = lanes_at.of
         ctrl[:n] = controls[:, 0]
+        switches = (
+            {}
+            if off is None or not off.any()
+            else {stretch.start: off[:, stretch.start] for stretch in constant_stretches(off)}
+        )
+        ranges = self.force_ranges() if switches else None
+        if ranges is not None:
+            ranges.write(switches[0])
         self.batch.forward(ids)
         for k in range(steps):
             ctrl[:n] = controls[:, k]
+            if ranges is not None and k in switches:
+                ranges.write(switches[k])
+                changes[:, k] = True
             force, limit = asking.at(k, lanes_at.look(changes[:, k]))
             applied[:n] = forces[:, k]
             applied[:n, of] += force
@@ -337,6 +359,8 @@ class Bench:
             self.batch.step(ids)
             for name, values in result.items():
                 values[:, k] = shown[name]
+        if ranges is not None:
+            ranges.restore()
         self._fails(n)
         return result
 

@@ -111,6 +111,7 @@ class Linear:
             "forces": self._simulator.wide(self._work.acting).spread(given.forces[0]),
             "instant": given.instant[0],
             "inputs": {name: u[0] for name, u in given.felt.items()},
+            "off": given.off[0],
         }
 
     def _afloat(self, fields: Mapping[str, Array]) -> Afloat:
@@ -271,8 +272,8 @@ class Linear:
         for lane, (number, one, _) in enumerate(rows):
             if one.signal not in numbers:
                 continue
-            series = felt[one.signal][lane] - self._motion.inputs[one.signal]
             column = numbers[one.signal]
+            series = felt[one.signal][lane] - self._motion.controls[:, column]
             at_once = instant[one.signal][lane] - self._motion.instant[:, column]
             change = Change(number, actuator=column, series=series, instant=at_once)
             result.setdefault(number, []).append(change)

@@ -281,6 +281,13 @@ class Robot:
             return self.joints[on].force_unit
         return _UNITS.get(kind, "1")
 
+    def integrates(self, actuator: Actuator) -> bool:
+        """Whether an actuator's force follows the integral of its control, as ``intvelocity``."""
+        import mujoco
+
+        integrator = int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
+        return int(self.compiled.actuator_dyntype[actuator.id]) == integrator
+
     def joint(self, name: str) -> Joint:
         """The joint of this name.
 
@@ -344,7 +351,9 @@ def _kind(model: Any, i: int) -> Drive:
     gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]
     fixed = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
     affine = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
-    direct = int(model.actuator_dyntype[i]) == int(mujoco.mjtDyn.mjDYN_NONE)
+    dynamics = int(model.actuator_dyntype[i])
+    # A filter changes when a control acts, not what it means.
+    direct = dynamics == int(mujoco.mjtDyn.mjDYN_NONE) or dynamics in filters()
     pid = getattr(mujoco.mjtGain, "mjGAIN_PID", None)  # since MuJoCo 4
     if pid is not None and int(model.actuator_gaintype[i]) == int(pid):
         return "pid"
@@ -357,6 +366,13 @@ def _kind(model: Any, i: int) -> Drive:
     if bias[0] == 0 and bias[1] == 0 and bias[2] == -gain[0]:
         return "velocity"
     return "other"
+
+
+def filters() -> tuple[int, int]:
+    """Return MuJoCo's numbers of first-order filters before an actuator (mjtDyn)."""
+    import mujoco
+
+    return int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 
 
 def _axes(count: int) -> list[str]:

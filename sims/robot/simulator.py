@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -18,6 +19,13 @@ from sims import effects as library
 from sims.base import Array, InputError, Scenario, unknown
 from sims.plan import Runs, make_runs
 from sims.robot.acting import derives, filled, is_asked, lanes_with, natives, part_of
+from sims.robot.activation_filters import (
+    ActivationFilter,
+    activation_filters,
+    is_fourth_order,
+    stated_activations,
+    with_history,
+)
 from sims.robot.bench_cache import RefusedModelError, bench_cache
 from sims.robot.compiled import compiled
 from sims.robot.drives import Shown
@@ -33,6 +41,7 @@ from sims.robot.numerics import INTEGRATORS, Numerics, RobotEngine, own_numerics
 from sims.robot.quiet import quiet
 from sims.robot.sampling import sampled
 from sims.robot.series import Added, by_series
+from sims.robot.switched_off import off_steps, working_servos
 from sims.robot.system import RobotSystem, system_of
 from sims.robot.work import Given, Made, Start, Work, by_run, instants
 from sims.simulated import Simulated
@@ -132,7 +141,7 @@ class RobotSimulator(Simulated):
     ) -> Array:
         """See `Simulated`."""
         acting = self._acting(theta)
-        runs = make_runs(scenarios)
+        runs = make_runs(scenarios, by_initial=True)
         commands = [self.run_inputs(s) for s in runs.distinct]
         _, x, v = self._known(scenarios, initial)
         return self._lanes(acting, runs, commands, x, v)
@@ -273,7 +282,51 @@ class RobotSimulator(Simulated):
                 forces[:, :, joint.velocity] = felt[f"force.{joint.name}"]
         dofs = self.addresses.velocities
         forces[:, :, dofs] += over_time(self.robotic, work.acting, begins, len(dofs), n)
-        return Given(controls, forces, felt, given)
+        begun = np.zeros((n, model.na))
+        for one in activation_filters(self.robot):
+            taken = controls[:, :, one.actuator.control]
+            begun[:, one.address] = self._first_activation(one, work, taken)
+            # Servos follow the activation in place of the command.
+            activations = self._activations(one, taken, begun[:, one.address])
+            felt = {**felt, f"u.{one.actuator.name}": activations[:, :-1]}
+        off = off_steps(self.robot, work.scenario, self.step, steps)
+        return Given(controls, forces, felt, given, begun, np.broadcast_to(off, (n, *off.shape)))
+
+    def _first_activation(self, one: ActivationFilter, work: Work, controls: Array) -> Array:
+        """Return the activation (n,) of a filter at the start of a run.
+
+        Args:
+            one: the filter.
+            work: the lanes of the run.
+            controls: (n, S) its controls.
+        """
+        stated = stated_activations(self.robot, work.scenario.initial)
+        if one.state in stated:
+            return np.full(len(work.x), stated[one.state])
+        settled: Array = np.clip(one.clipped(controls[:, 0]), *one.limits)
+        history = with_history(work.scenario, self.step)
+        if history is None:
+            return settled
+        scenario, steps = history
+        commands = self.run_inputs(scenario)
+        n = len(work.x)
+        felt = felt_over(self.step, scenario, commands, work.acting, n, steps)
+        earlier = felt[f"u.{one.actuator.name}"]
+        last: Array = self._activations(one, earlier, one.clipped(earlier[:, 0]))[:, -1]
+        return last
+
+    def _activations(self, one: ActivationFilter, controls: Array, begun: Array) -> Array:
+        """Return the activations (n, S + 1) of a filter."""
+        engine = self.engine
+        assert isinstance(engine, RobotEngine)
+        fourth = is_fourth_order(int(engine.numerics.settings()["integrator"]))
+        return one.activations(controls, begun, self.step, fourth)
+
+    def run_initial(self, scenario: Scenario) -> dict[str, float]:
+        """See `Simulator`; activations of filters are not states that are estimated."""
+        stated = stated_activations(self.robot, scenario.initial)
+        own = {name: v for name, v in scenario.initial.items() if name not in stated}
+        return super().run_initial(replace(scenario, initial=own))
 
     def wide(self, acting: Acting = ()) -> Bench:
         """Lanes for looking at many instants of one motion at once, in which this acts."""
@@ -319,7 +372,7 @@ class RobotSimulator(Simulated):
         places, second = bench.places, bench.second
         bench.load(filled(natives(start.acting), n, bench.count))
         behind = bench.begin(start.x, start.v, start.afloat)
-        begun = bench.settle(given.controls[:, 0])
+        bench.activate(given.activations)
         record = ["qpos", "qvel", *more]
         if self._feels():
             record.append("sensordata")
@@ -328,9 +381,16 @@ class RobotSimulator(Simulated):
             stiffness = bench.stiffness(places)[:n]
             asking = Forces(self.robotic, start.acting, given.felt, places, stiffness, self.step)
             forces = bench.spread(given.forces)
-            done = bench.ask(given.controls, forces, compiled(asking) or asking, record)
+            asked_of = None
+            if given.off.any():
+                # Compiled effects take servos for equally stiff in all steps.
+                asking.working = working_servos(bench.robot, places.velocities, given.off)
+            else:
+                asked_of = compiled(asking)
+            done = bench.ask(given.controls, forces, asked_of or asking, record, given.off)
         else:
-            done = bench.run(given.controls, bench.spread(given.forces), record)
+            forces = bench.spread(given.forces)
+            done = bench.run(given.controls, forces, record, given.off)
         x = np.concatenate([start.x[:, None], done["qpos"][:, :, places.positions]], axis=1)
         v = np.concatenate([start.v[:, None], done["qvel"][:, :, places.velocities]], axis=1)
         x[bench.failed] = np.nan
@@ -343,7 +403,7 @@ class RobotSimulator(Simulated):
             np.concatenate([first[:, None], rest], axis=1)
             for first, rest in zip(behind, after, strict=True)
         ]
-        return Made(x, v, done, begun, bench.failed, (hidden[0], hidden[1]))
+        return Made(x, v, done, given.activations, bench.failed, (hidden[0], hidden[1]))
 
     def _bench(self, derived: bool, count: int, series: Added = ()) -> Bench:
         engine = self.engine

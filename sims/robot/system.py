@@ -12,6 +12,7 @@ from sims import effects as library
 from sims.base import Array, Channel, InputError, Parameter, unknown
 from sims.registry import SkippedError
 from sims.robot import coupled, places
+from sims.robot.activation_filters import activation_filters
 from sims.robot.floating import Floating
 from sims.robot.model import Robot
 from sims.robot.moment import OneJoint, Slide
@@ -20,6 +21,12 @@ from sims.robot.series import Added, compile_error, is_series
 from sims.robot.spots import WORDS, Spot, spots
 from sims.robot.usual import Usual
 from sims.system import FAMILY, Effect, Kind, Moment, System
+
+INTEGRATES = (
+    "the actuator integrates its control (dyntype integrator), and no recording says where its "
+    "integral begins; expected a position servo, whose input is the integral"
+)
+"""Why a recording cannot have the control of an integrator."""
 
 
 class RobotSystem(System):
@@ -32,6 +39,8 @@ class RobotSystem(System):
         drives: by coordinate, the inputs of its actuators.
         servos: by coordinate, the input that is the set point of its position servo.
         gears: and by how much that turns for each unit of the coordinate.
+        activations: names under which a recording may state the first activations of filters.
+        refused_inputs: by input, why a recording cannot have it.
         traced: by inputs, the effects that were compiled (`sims.robot.compiled`).
     """
 
@@ -52,6 +61,8 @@ class RobotSystem(System):
     drives: ClassVar[Mapping[int, tuple[str, ...]]]
     servos: ClassVar[Mapping[int, str]]
     gears: ClassVar[Mapping[int, float]]
+    activations: ClassVar[tuple[str, ...]]
+    refused_inputs: ClassVar[Mapping[str, str]]
     freed: ClassVar[frozenset[str]] = frozenset()
     freed_effects: ClassVar[tuple[type[Effect], ...]] = ()
     traced: ClassVar[dict[tuple[str, ...], Any]]
@@ -225,6 +236,10 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
         "drives": drives,
         "servos": servos,
         "gears": gears,
+        "activations": tuple(one.state for one in activation_filters(robot)),
+        "refused_inputs": MappingProxyType(
+            {f"u.{a.name}": INTEGRATES for a in robot.actuators if robot.integrates(a)}
+        ),
     }
     system: type[RobotSystem] = type("RobotSystemOfFile", (RobotSystem,), declared)
     if not free:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sims.base import Array, Scenario
 from sims.plan import Runs
 from sims.robot.floating import Afloat
 from sims.robot.midway import Mask, Places
 from sims.system import Acting, Sensor
+
+Number = TypeVar("Number", bound=np.generic)
 
 BEYOND, LATE = 1.1, 0.2
 """How far beyond its end a run is simulated at most where sensors are early: times its length, and
@@ -70,14 +73,18 @@ class Given(NamedTuple):
     Attributes:
         controls: (n, S, nu).
         forces: (n, S, nv) generalised.
-        felt: inputs, (n, S) by name.
+        felt: inputs, (n, S) by name; behind a filter before an actuator, its activation.
         instant: controls as they are when each step begins.
+        activations: (n, na) of actuators when the first step begins.
+        off: (n, S, K) which actuators are switched off.
     """
 
     controls: Array
     forces: Array
     felt: Mapping[str, Array]
     instant: Array
+    activations: Array
+    off: Mask
 
     @classmethod
     def of(cls, parts: Sequence[Given]) -> Given:
@@ -91,10 +98,12 @@ class Given(NamedTuple):
             np.concatenate([_lasting(part.forces, steps) for part in parts]),
             {n: np.concatenate([_lasting(part.felt[n], steps) for part in parts]) for n in names},
             np.concatenate([_lasting(part.instant, steps) for part in parts]),
+            np.concatenate([part.activations for part in parts]),
+            np.concatenate([_lasting(part.off, steps) for part in parts]),
         )
 
 
-def _lasting(values: Array, steps: int) -> Array:
+def _lasting(values: NDArray[Number], steps: int) -> NDArray[Number]:
     """(n, S', ...) drawn out to so many steps by their last."""
     more = steps - values.shape[1]
     if not more:

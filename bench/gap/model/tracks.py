@@ -70,7 +70,7 @@ def tracked(
     return Track(
         name=run.name,
         scenario=Scenario(
-            run.times, begun, run.inputs, constants, run.linear, run.offset, run.before
+            run.times, begun, run.inputs, constants, run.linear, run.offset, run.before, run.off
         ),
         observed=np.stack(columns, axis=1),
         guess=np.array([guesses[name] for name in states]),
@@ -126,7 +126,8 @@ def first_of(scenario: Scenario, samples: int) -> Scenario:
     if samples >= scenario.times.size:
         return scenario
     inputs = {name: signal[:samples] for name, signal in scenario.inputs.items()}
-    return replace(scenario, times=scenario.times[:samples], inputs=inputs)
+    off = {name: mask[:samples] for name, mask in scenario.off.items()}
+    return replace(scenario, times=scenario.times[:samples], inputs=inputs, off=off)
 
 
 def beginning(times: Array, values: Array) -> tuple[float, float]:

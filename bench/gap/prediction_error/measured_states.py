@@ -61,12 +61,21 @@ def _measured(world: World, sigma: Array, run: int) -> Mapping[int, Array]:
         readings.append((np.stack(values, axis=1), np.array(noise)))
     if not joints:
         return {}
-    found = _tracked(times, readings)
+    found = track_joints(times, readings)
     return dict(zip(joints, found, strict=True))
 
 
-def _tracked(times: Array, readings: list[tuple[Array, Array]]) -> list[Array]:
-    """Filter and smooth joints by (1), each with the likeliest jerk: (T, 3) each."""
+def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Array]:
+    """Filter and smooth joints by (1), each with the likeliest jerk.
+
+    Args:
+        times: (T,) of the samples.
+        readings: of each joint, positions and velocities (T, 2), NaN where they are missing, and
+            the standard deviations of their noise (2,).
+
+    Returns:
+        Of each joint, positions, velocities and accelerations (T, 3).
+    """
     steps = np.diff(times)
     count, samples = len(readings), times.size
     a = np.tile(np.eye(3), (samples - 1, 1, 1))

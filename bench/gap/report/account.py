@@ -245,6 +245,7 @@ def unfixed(story: Story) -> list[str]:
 def following(story: Story) -> Iterator[str]:
     """The sentences that follow the headline at once: the gain, and what the verdict owes."""
     verdict = story.verdict.verdict
+    yield from (sentence(note) for note in story.verdict.recording_notes)
     if story.verdict.recording_faults:
         yield from _of_faults(story.verdict.recording_faults)
         return

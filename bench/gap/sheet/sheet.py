@@ -16,6 +16,7 @@ from bench.gap.sheet.quantity import quantities
 from bench.gap.sheet.reach import shown
 from bench.gap.sheet.subject import Subject, subject_of
 from bench.gap.verdict import Verdict
+from bench.recordings.filter_start import leave_out_settling
 from bench.recordings.pieces import cut
 from sims import effects as library
 from sims.arguments import check_arguments
@@ -86,6 +87,7 @@ def sheet(
         if channel not in there:
             raise unknown(f"channel of {recording.path}", channel, there)
     recording = replace(recording, constants={**extended.constants, **recording.constants})
+    recording, _ = leave_out_settling(recording, kind)
     recording, _ = cut(recording, kind)
     is_driven = subject.is_driven(recording)
     asked = tuple(

@@ -1,0 +1,525 @@
+"""Find samples of a robot's recording in which a drive does nothing, before anything is fitted.
+
+A drive that is switched off, a servo that is limp after a fault and an emergency stop leave the
+commands going on. Every effect of the library could only imitate that. From positions alone come
+velocities and accelerations (`measured_states`), and from these three forces at each joint and
+sample: the force that the motion needs by inverse dynamics, f; the force of the model's drive, τ;
+and the force that holds the joint still, g. Three hypotheses leave
+
+    on: f - τ,        off: f,        held (by a brake): f - g                                    (1)
+
+A sequence of hypotheses with few changes follows by dynamic programming (A. J. Viterbi 1967,
+doi:10.1109/TIT.1967.1054010), with the cost min(|e| / s, `LARGEST`) of a sample, s the median of
+the smallest of (1), and `CHANGE` for each change. A stretch that is off or held stands only if
+
+* what the model's drive misses there is `WORSE` times what it misses elsewhere: a gain, a friction
+  or a dead zone that is wrong is wrong everywhere;
+* its hypothesis leaves `LEFT` of that, and `LEFT` of what the drive exerts elsewhere: a drive at
+  its force limit exerts more than elsewhere;
+* there are no more than `MOST` of them in a run.
+
+Sizes are the quantile `TYPICAL` of magnitudes over all such stretches of a joint. Among 500 random
+effects of the library at an arm with motors or servos, four were taken for a drive that does
+nothing.
+
+All drives are held at once, up to the end of a run or from its beginning, and the first two
+conditions are those of one of them: a joint that presses against a stop stands still, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.gap.prediction_error.measured_states import track_joints
+from bench.recordings.noise import estimated
+from sims.base import Array, Simulator
+from sims.recording.drive_switches import (
+    DriveSwitch,
+    parts_without,
+    spans,
+    spans_of_runs,
+    switched_runs,
+)
+from sims.recording.recording import Recording, Run
+from sims.robot.activation_filters import activation_filters
+from sims.robot.model import Robot
+
+Mask = NDArray[np.bool_]
+
+ON, OFF, HELD = 0, 1, 2
+"""Numbers of the hypotheses."""
+LARGEST = 8.0
+"""Largest cost of a sample, so that single samples decide nothing."""
+CHANGE = 40.0
+"""Cost of a change from one hypothesis to another."""
+AS_GOOD = 0.5
+"""Share of `CHANGE` that a column may cost more than the likeliest stretches, for each change."""
+TYPICAL = 0.8
+"""Quantile of magnitudes that is compared."""
+WORSE = 2.0
+"""Factor by which a drive that does nothing makes the model miss more."""
+LEFT = 0.4
+"""Share that a hypothesis leaves at most."""
+BETTER = 0.6
+"""The same of a single stretch."""
+SLOW = 0.1
+"""Share of its usual velocity below which a joint that is held stands still."""
+MOST = 3
+"""Maximum number of stretches of a run."""
+SHORTEST = 20
+"""Minimum number of samples of a stretch, and of those in which a drive works."""
+EDGE = 5
+"""Number of samples on either side of a change in which the smoothed motion does not tell when it
+was.
+"""
+MOST_SAMPLES = 20_000
+"""Maximum number of samples at which forces are computed."""
+SMALLEST_SCALE = 1e-3
+"""Smallest s, as a share of the force that the motion needs."""
+
+
+class JointForces(NamedTuple):
+    """Forces at the D joints of a robot in the T samples of a run, (T, D) each.
+
+    Attributes:
+        needed: by the measured motion.
+        driven: what the model's drives exert on it.
+        holding: what holds the joints still.
+        velocity: of the joints.
+    """
+
+    needed: Array
+    driven: Array
+    holding: Array
+    velocity: Array
+
+    def residuals(self, joint: int) -> Array:
+        """(3, T) what the hypotheses (1) leave at a joint."""
+        needed = self.needed[:, joint]
+        return np.stack([needed - self.driven[:, joint], needed, needed - self.holding[:, joint]])
+
+
+@dataclass(frozen=True)
+class InactiveDrive:
+    """A drive that does nothing in some samples.
+
+    Attributes:
+        joint: that it drives.
+        actuators: of the joint.
+        is_held: whether the joint is held still, as by a brake, and not free.
+        masks: (T,) of each run, the samples.
+        costs: (2, T / every) of each run, of a drive that is on and of one that does nothing.
+        every: number of samples of which one has costs.
+    """
+
+    joint: str
+    actuators: tuple[str, ...]
+    is_held: bool
+    masks: tuple[Mask, ...]
+    costs: tuple[Array, ...]
+    every: int
+
+    def is_likely(self, masks: Sequence[Mask]) -> bool:
+        """Whether the drive does nothing in the samples of masks (T,) of the runs, and only there.
+
+        A drive whose commands ask for little does not tell when it is switched off: the masks may
+        cost a little more than the likeliest ones.
+        """
+        more, changes = 0.0, 0
+        for costs, mask, own in zip(self.costs, masks, self.masks, strict=True):
+            given = np.where(mask[:: self.every], costs[1], costs[0])
+            likeliest = np.where(own[:: self.every], costs[1], costs[0])
+            more += float((given - likeliest).sum())
+            if len(spans(mask)) > MOST:
+                return False
+            changes += int((mask[1:] != mask[:-1]).sum())
+        return more <= AS_GOOD * CHANGE * max(changes, 1)
+
+
+def without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
+    """Switch off or leave out what drives do nothing about, and say so in the recording's notes.
+
+    Where a column of the recording says when a drive is off, the drive is taken to be off there;
+    else the samples are left out.
+
+    Args:
+        recording: as it was read, before its runs are divided.
+        kind: a simulator of its system.
+    """
+    drives = inactive_drives(recording, kind)
+    if not drives:
+        return recording
+    notes = list(recording.notes)
+    runs = recording.runs
+    left_out = [np.zeros(run.times.size, dtype=bool) for run in runs]
+    unexplained: list[InactiveDrive] = []
+    for drive in drives:
+        switches = [] if drive.is_held else _switches(recording, drive)
+        if not switches:
+            unexplained.append(drive)
+            left_out = [a | _widened(b) for a, b in zip(left_out, drive.masks, strict=True)]
+            continue
+        runs, said = switched_runs(recording.path, runs, switches)
+        lines = " and ".join(switch.line for switch in switches)
+        description = recording.path.with_suffix(".toml").name
+        notes += [
+            f"{text}, and the motion needs no force of it: the drive is taken to be off; state it "
+            f"in {description}: {lines}"
+            for text in said
+        ]
+    pairs = zip(runs, left_out, strict=True)
+    kept = [part for run, mask in pairs for part in parts_without(run, mask)]
+    if unexplained and any(not run.held_out for run in kept):
+        notes += [_message(recording, unexplained, left_out)]
+        runs = tuple(kept)
+    return replace(recording, runs=tuple(runs), notes=tuple(notes))
+
+
+def _message(
+    recording: Recording, drives: Sequence[InactiveDrive], left_out: Sequence[Mask]
+) -> str:
+    """What is to be said of drives for whose state there is no column."""
+    joints = ", ".join(drive.joint for drive in drives)
+    where = spans_of_runs(recording.runs, left_out)
+    noun = "joint" if len(drives) == 1 else "joints"
+    does = "the joints stand still" if drives[0].is_held else "the motion needs no force of them"
+    column = _changing_column(recording, drives)
+    near = f"; column {column} changes there" if column else ""
+    name = drives[0].actuators[0]
+    line = DriveSwitch(name, "COLUMN", True).line
+    return (
+        f"the drives of {noun} {joints} do nothing in some samples, which are left out ({where}): "
+        f"{does}, whatever is commanded{near}; if a column says when a drive is on, state it: "
+        f"{line}"
+    )
+
+
+def _switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwitch]:
+    """The switches of a drive's actuators by the first column that says when it is off."""
+    for column in recording.runs[0].extra:
+        for zero_is_off in (True, False):
+            found = [DriveSwitch(name, column, zero_is_off) for name in drive.actuators]
+            if drive.is_likely([found[0].off(run) for run in recording.runs]):
+                return found
+    return []
+
+
+def _changing_column(recording: Recording, drives: Sequence[InactiveDrive]) -> str:
+    """The name of the first other column that changes where drives begin or cease to do nothing,
+    and nowhere else; empty where there is none.
+    """
+    for column in recording.runs[0].extra:
+        hits, others = 0, 0
+        for number, run in enumerate(recording.runs):
+            values = run.extra[column]
+            changes = np.flatnonzero(np.diff(values) != 0) + 1
+            found = np.any([drive.masks[number] for drive in drives], axis=0)
+            near = _widened(found) & _widened(~found)
+            hits += int(near[changes].sum())
+            others += int((~near[changes]).sum())
+        if hits and not others:
+            return column
+    return ""
+
+
+def _widened(mask: Mask) -> Mask:
+    """A mask with some samples more on either side."""
+    wide: Mask = np.convolve(mask, np.ones(2 * EDGE + 1), mode="same") > 0.5
+    return wide
+
+
+def inactive_drives(recording: Recording, kind: type[Simulator]) -> list[InactiveDrive]:
+    """Find drives that do nothing in some samples, by (1).
+
+    Args:
+        recording: as it was read.
+        kind: a simulator of its system.
+
+    Returns:
+        The drives; none where the positions of some joints are not recorded, where bodies float,
+        or where joints are coupled by equalities.
+    """
+    robot = getattr(kind, "robot", None)
+    if not kind.has_model or robot is None or not _is_open_chain(robot, recording):
+        return []
+    total = sum(run.times.size for run in recording.runs)
+    every = -(-total // MOST_SAMPLES)
+    with np.errstate(all="ignore"):
+        forces = [_forces(robot, recording, run) for run in _thinned(recording, every)]
+    driven = [a for a in robot.actuators if a.joint is not None and a.kind != "other"]
+    actuators = {
+        number: tuple(a.name for a in driven if a.joint == joint.name)
+        for number, joint in enumerate(robot.joints)
+    }
+    joints = [number for number, names in actuators.items() if names]
+    drives = []
+    for joint in joints:
+        stretches = _Stretches(forces, [joint], OFF)
+        if stretches.any():
+            drives.append((joint, stretches))
+    if not drives and joints:
+        stretches = _Stretches(forces, joints, HELD)
+        drives = [(joint, stretches) for joint in joints] if stretches.any() else []
+    return [
+        InactiveDrive(
+            robot.joints[joint].name,
+            actuators[joint],
+            stretches.state == HELD,
+            tuple(
+                np.repeat(mask, every)[: run.times.size]
+                for mask, run in zip(stretches.masks, recording.runs, strict=True)
+            ),
+            tuple(stretches.costs),
+            every,
+        )
+        for joint, stretches in drives
+    ]
+
+
+def _is_open_chain(robot: Robot, recording: Recording) -> bool:
+    """Whether forces follow from the recorded positions."""
+    recorded = recording.runs[0].channels
+    singles = all(joint.single and f"q.{joint.name}" in recorded for joint in robot.joints)
+    long = all(run.times.size > 3 * SHORTEST for run in recording.runs)
+    return singles and long and not robot.compiled.neq and bool(robot.actuators)
+
+
+def _thinned(recording: Recording, every: int) -> list[Run]:
+    """Every k-th sample of all runs."""
+    return [run.part(slice(None, None, every)) for run in recording.runs]
+
+
+def _forces(robot: Robot, recording: Recording, run: Run) -> JointForces:
+    """Compute the forces of (1) by MuJoCo's inverse dynamics."""
+    import mujoco
+
+    model = robot.compiled
+    data = mujoco.MjData(model)
+    states = np.stack(track_joints(run.times, _readings(robot, recording, run)))
+    positions = [joint.position for joint in robot.joints]
+    dofs = [joint.velocity for joint in robot.joints]
+    controls, activations = _controls(robot, run)
+    applied = np.zeros((run.times.size, model.nv))
+    for joint in robot.joints:
+        name = f"force.{joint.name}"
+        if name in run.inputs:
+            applied[:, joint.velocity] = _about(run, name)
+    shape = run.times.size, len(dofs)
+    needed, driven, holding = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    for k in range(run.times.size):
+        data.qpos[positions] = states[:, k, 0]
+        data.qvel[:], data.qacc[:] = 0.0, 0.0
+        mujoco.mj_inverse(model, data)
+        holding[k] = data.qfrc_inverse[dofs] - applied[k, dofs]
+        data.qvel[dofs] = states[:, k, 1]
+        data.qacc[dofs] = states[:, k, 2]
+        mujoco.mj_inverse(model, data)
+        needed[k] = data.qfrc_inverse[dofs] - applied[k, dofs]
+        data.ctrl[:] = controls[k]
+        data.act[:] = activations[k]
+        mujoco.mj_fwdActuation(model, data)
+        driven[k] = data.qfrc_actuator[dofs]
+    names = [joint.name for joint in robot.joints]
+    for name, off in run.off.items():
+        of = robot.actuator(name).joint
+        if of is not None:
+            # Where it is known to be off, both hypotheses agree.
+            driven[off, names.index(of)] = 0.0
+    return JointForces(needed, driven, holding, states[:, :, 1].T)
+
+
+def _readings(robot: Robot, recording: Recording, run: Run) -> list[tuple[Array, Array]]:
+    """Recorded positions and velocities of all joints, and their noise."""
+    readings = []
+    for joint in robot.joints:
+        columns, noise = [], []
+        for name in (f"q.{joint.name}", f"qd.{joint.name}"):
+            values = run.channels.get(name, np.full(run.times.size, np.nan))
+            columns.append(values)
+            sigma = recording.noise.get(name, 0.0)
+            if not sigma > 0 and name in run.channels:
+                sigma = estimated([(run.times, values)]).sigma
+            noise.append(sigma if np.isfinite(sigma) and sigma > 0 else 1e-6)
+        readings.append((np.stack(columns, axis=1), np.array(noise)))
+    return readings
+
+
+def _about(run: Run, name: str) -> Array:
+    """(T,) an input about each sample: the mean of what it was until then and is from then on."""
+    values = run.inputs[name]
+    if name in run.linear:
+        return values
+    earlier = np.concatenate([values[:1], values[:-1]])
+    mean: Array = 0.5 * (values + earlier)
+    return mean
+
+
+def _controls(robot: Robot, run: Run) -> tuple[Array, Array]:
+    """Controls (T, nu) and activations (T, na) at the samples."""
+    model = robot.compiled
+    controls = np.zeros((run.times.size, model.nu))
+    activations = np.zeros((run.times.size, model.na))
+    for actuator in robot.actuators:
+        name = f"u.{actuator.name}"
+        if name in run.inputs:
+            controls[:, actuator.control] = _about(run, name)
+    steps = np.diff(run.times)
+    for one in activation_filters(robot):
+        taken = one.clipped(controls[:, one.actuator.control])
+        now = float(taken[0])
+        for k, kept in enumerate(np.exp(-np.append(steps, 0.0) / max(one.seconds, 1e-9)).tolist()):
+            activations[k, one.address] = now
+            now = taken[k] + kept * (now - taken[k])
+    return controls, activations
+
+
+class _Stretches:
+    """Stretches of runs in which a hypothesis about some joints holds, and not that drives are on.
+
+    Attributes:
+        state: number of the hypothesis, ``OFF`` or ``HELD``.
+        costs: (2, T) of each run, of drives that are on and of the hypothesis.
+        masks: (T,) of each run, where it holds.
+
+    Args:
+        forces: of the runs.
+        joints: numbers of the joints about which the hypothesis is.
+        state: see above.
+    """
+
+    def __init__(self, forces: Sequence[JointForces], joints: Sequence[int], state: int) -> None:
+        self.state = state
+        self._forces, self._joints = forces, joints
+        self._residuals = [[one.residuals(joint) for one in forces] for joint in joints]
+        self.costs = [np.zeros((2, len(one.needed))) for one in forces]
+        for of_runs in self._residuals:
+            for cost, more in zip(self.costs, _costs(of_runs, state), strict=True):
+                cost += more
+        masks = [_long(_likeliest(cost)) for cost in self.costs]
+        if max(len(spans(mask)) for mask in masks) > MOST:
+            masks = [np.zeros_like(mask) for mask in masks]
+        self.masks = self._standing(masks)
+
+    def any(self) -> bool:
+        """Whether there is one."""
+        return any(mask.any() for mask in self.masks)
+
+    def _standing(self, masks: Sequence[Mask]) -> list[Mask]:
+        """Return masks (T,) if they fulfil the conditions above, without single stretches that do
+        not; else empty ones.
+        """
+        nothing = [np.zeros_like(mask) for mask in masks]
+        working = [~_widened(mask) for mask in masks]
+        inner = [_inner(mask) for mask in masks]
+        if min(sum(int(m.sum()) for m in of_runs) for of_runs in (working, inner)) < SHORTEST // 2:
+            return nothing
+        missed = self._sizes(ON, working)
+        usual = self._sizes(self.state, working)
+        driven = self._sizes(ON, inner)
+        left = self._sizes(self.state, inner)
+        is_worse = any(d >= WORSE * m for d, m in zip(driven, missed, strict=True))
+        is_small = all(e <= LEFT * u for e, u in zip(left, usual, strict=True))
+        if not (is_worse and is_small and sum(left) <= LEFT * sum(driven)):
+            return nothing
+        fast = [
+            _size(np.concatenate([f.velocity[m, j] for f, m in self._with(working)]))
+            for j in self._joints
+        ]
+        result = []
+        for run, (mask, within) in enumerate(zip(masks, inner, strict=True)):
+            standing = np.zeros_like(mask)
+            for first, end in spans(mask):
+                own = [np.zeros_like(m) for m in masks]
+                own[run][first:end] = within[first:end]
+                better = sum(self._sizes(self.state, own)) <= BETTER * sum(self._sizes(ON, own))
+                standing[first:end] = better and (
+                    self.state == OFF or self._is_still(run, own[run], (first, end), fast)
+                )
+            result.append(standing)
+        return result
+
+    def _with(self, masks: Sequence[Mask]) -> zip[tuple[JointForces, Mask]]:
+        """Pair forces of runs with masks."""
+        return zip(self._forces, masks, strict=True)
+
+    def _sizes(self, state: int, masks: Sequence[Mask]) -> list[float]:
+        """Return how large the residuals of a hypothesis are in masks (T,), by joint."""
+        return [
+            _size(np.concatenate([r[state, m] for r, m in zip(of_runs, masks, strict=True)]))
+            for of_runs in self._residuals
+        ]
+
+    def _is_still(self, run: int, mask: Mask, ends: tuple[int, int], fast: Sequence[float]) -> bool:
+        """Whether all joints stand still in a stretch, at an end of the run."""
+        velocity = self._forces[run].velocity
+        at_end = ends[0] <= EDGE or ends[1] >= mask.size - EDGE
+        still = [
+            _size(velocity[mask, j]) <= SLOW * f for j, f in zip(self._joints, fast, strict=True)
+        ]
+        return at_end and all(still)
+
+
+def _inner(mask: Mask) -> Mask:
+    """A mask without the samples beside changes, where the smoothed motion is blurred."""
+    result = np.zeros_like(mask)
+    for first, end in spans(mask):
+        result[first + EDGE * (first > 0) : end - EDGE * (end < mask.size)] = True
+    return result
+
+
+def _costs(residuals: Sequence[Array], state: int) -> list[Array]:
+    """Costs (2, T) of each run, of a drive that is on and of a hypothesis about one joint."""
+    chosen = [ON, state]
+    pooled = np.concatenate(residuals, axis=1)[chosen]
+    pooled = pooled[:, np.isfinite(pooled).all(axis=0)]
+    if not pooled.size:
+        return [np.zeros((2, r.shape[1])) for r in residuals]
+    scale = float(np.median(np.abs(pooled).min(axis=0)))
+    scale = max(scale, SMALLEST_SCALE * _size(pooled[1]))
+    if not scale > 0:
+        return [np.zeros((2, r.shape[1])) for r in residuals]
+    return [
+        np.minimum(np.abs(np.nan_to_num(r[chosen], nan=LARGEST * scale)) / scale, LARGEST)
+        for r in residuals
+    ]
+
+
+def _likeliest(costs: Array) -> Mask:
+    """(T,) where the second of two hypotheses is chosen, by dynamic programming over costs
+    (2, T).
+    """
+    count = costs.shape[1]
+    from_other = np.zeros((2, count), dtype=bool)
+    best = costs[:, 0].copy()
+    for k in range(1, count):
+        changed = best[::-1] + CHANGE
+        from_other[:, k] = changed < best
+        best = np.minimum(best, changed) + costs[:, k]
+    result = np.zeros(count, dtype=bool)
+    now = int(np.argmin(best))
+    for k in range(count - 1, -1, -1):
+        result[k] = now == 1
+        if from_other[now, k]:
+            now = 1 - now
+    return result
+
+
+def _long(mask: Mask) -> Mask:
+    """A mask without stretches that are too short."""
+    result = np.zeros_like(mask)
+    for first, end in spans(mask):
+        result[first:end] = end - first >= SHORTEST
+    return result
+
+
+def _size(values: Array) -> float:
+    """A quantile of magnitudes (n,): impacts, of which the smoothed motion knows little, are
+    beyond it.
+    """
+    finite = np.abs(values[np.isfinite(values)])
+    return float(np.quantile(finite, TYPICAL)) if finite.size else 0.0

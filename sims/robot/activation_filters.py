@@ -1,0 +1,156 @@
+"""First-order filters before actuators: MuJoCo's dyntype ``filter`` and ``filterexact``.
+
+With u the control, a the activation that takes its place, T the time constant and h the step,
+
+    filter        a[k+1] = a[k] + (h / T) (u[k] - a[k])                                         (1)
+    filterexact   a[k+1] = a[k] + (1 - exp(-h / T)) (u[k] - a[k])                               (2)
+
+The activation at the start of a run is not recorded. It is, in this order: what the recording
+states; what (1) or (2) makes of the commands before the run, where they are known; the first
+command.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sims.base import Array, Scenario
+from sims.effects.lag import recur
+from sims.robot.model import Actuator, Robot, filters, kept_with_robot
+from sims.robot.native import RK4
+
+STATE = "act."
+"""Beginning of the names under which a recording states activations."""
+SHORTEST = 1e-15
+"""Smallest time constant in seconds, MuJoCo's mjMINVAL."""
+SETTLED = 10.0
+"""Number of time constants after which a wrong first activation has no effect: exp(-10) of it is
+left, less than the accuracy of a simulation.
+"""
+
+
+class ActivationFilter(NamedTuple):
+    """A filter before an actuator.
+
+    Attributes:
+        actuator: whose.
+        address: of its activation, in MuJoCo's ``act``.
+        seconds: its time constant.
+        exact: whether (2) holds, and not (1).
+        limits: lowest and highest activation; infinite where it is not limited.
+    """
+
+    actuator: Actuator
+    address: int
+    seconds: float
+    exact: bool
+    limits: tuple[float, float]
+
+    @property
+    def state(self) -> str:
+        """The name under which a recording states its activation."""
+        return STATE + self.actuator.name
+
+    def clipped(self, controls: Array) -> Array:
+        """Return controls within the control range, as the filter takes them."""
+        if self.actuator.range is None:
+            return controls
+        clipped: Array = np.clip(controls, *self.actuator.range)
+        return clipped
+
+    def activations(self, controls: Array, begun: Array, step: float, fourth: bool) -> Array:
+        """Compute activations at the beginnings of steps, by (1) or (2).
+
+        Args:
+            controls: (n, S) of the steps.
+            begun: (n,) first activations.
+            step: seconds of a step.
+            fourth: whether the integrator is of fourth order, with which (1) and (2) agree.
+
+        Returns:
+            (n, S + 1) activations, the last one after the last step.
+        """
+        ratio = step / max(self.seconds, SHORTEST)
+        kept = float(np.exp(-ratio)) if self.exact or fourth else 1.0 - ratio
+        taken = self.clipped(controls)
+        decay = np.full_like(taken, kept)
+        ends = recur(decay, (1.0 - decay) * taken, begun[:, None])
+        # A limit acts within the recursion, but commands that reach it stay beyond it for longer
+        # than a step: the difference lasts as long as the filter.
+        result: Array = np.clip(np.concatenate([begun[:, None], ends], axis=1), *self.limits)
+        return result
+
+
+@kept_with_robot
+def activation_filters(robot: Robot) -> tuple[ActivationFilter, ...]:
+    """Return the filters before a robot's actuators, of those with one control."""
+    import mujoco
+
+    model = robot.compiled
+    exact = int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    found = []
+    for actuator in robot.actuators:
+        i = actuator.id
+        if int(model.actuator_dyntype[i]) not in filters() or actuator.controls != 1:
+            continue
+        limited = bool(model.actuator_actlimited[i])
+        low, high = model.actuator_actrange[i] if limited else (-np.inf, np.inf)
+        found.append(
+            ActivationFilter(
+                actuator,
+                int(model.actuator_actadr[i]),
+                float(model.actuator_dynprm[i, 0]),
+                int(model.actuator_dyntype[i]) == exact,
+                (float(low), float(high)),
+            )
+        )
+    return tuple(found)
+
+
+def is_fourth_order(integrator: int) -> bool:
+    """Whether MuJoCo's integrator of this number is of fourth order."""
+    return integrator == RK4
+
+
+def stated_activations(robot: Robot, initial: Mapping[str, float]) -> dict[str, float]:
+    """Return the activations among the initial states of a run, by name."""
+    names = {one.state for one in activation_filters(robot)}
+    return {name: value for name, value in initial.items() if name in names}
+
+
+def longest_settling(robot: Robot, initial: Mapping[str, float]) -> float:
+    """Return seconds after which no filter remembers how a run began, without those whose first
+    activation is stated.
+    """
+    unknown = [one for one in activation_filters(robot) if one.state not in initial]
+    return SETTLED * max((one.seconds for one in unknown), default=0.0)
+
+
+def with_history(scenario: Scenario, step: float) -> tuple[Scenario, int] | None:
+    """Return a scenario that begins as many whole steps earlier as its inputs are known before the
+    run, and the number of these steps; None where they are not known.
+    """
+    names = [name for name in scenario.inputs if name in scenario.before]
+    stamps = scenario.before[names[0]][0] if names else np.empty(0)
+    steps = int(np.floor(-stamps[0] / step)) if stamps.size else 0
+    # Inputs of one run are known at the same instants.
+    alike = all(np.array_equal(scenario.before[name][0], stamps) for name in names)
+    if steps < 1 or len(names) < len(scenario.inputs) or not alike:
+        return None
+    first = -steps * step
+    later = stamps > first
+    times = np.concatenate([[first], stamps[later], scenario.times - scenario.times[0]])
+    inputs = {}
+    for name, values in scenario.inputs.items():
+        own = scenario.before[name][1]
+        if name in scenario.linear:
+            ends = np.append(stamps, 0.0), np.append(own, values[0])
+            begun = float(np.interp(first, *ends))
+        else:
+            begun = float(own[np.flatnonzero(stamps <= first)[-1]])
+        inputs[name] = np.concatenate([[begun], own[later], values])
+    return replace(scenario, times=times - first, inputs=inputs, before={}, off={}), steps

@@ -1,0 +1,114 @@
+"""``[actuators.NAME] enable`` and ``disable``: what they read, and what they refuse in one line."""
+
+import numpy as np
+import pytest
+
+from bench.recordings.inspection import load, summary
+from sims.base import InputError
+
+ROBOT = """
+<mujoco>
+  <worldbody><body>
+    <joint name="hinge" axis="0 1 0" damping="0.1"/>
+    <inertial pos="0 0 -0.2" mass="0.5" diaginertia="0.002 0.002 0.001"/>
+  </body></worldbody>
+  <actuator><position name="m" joint="hinge" kp="5" kv="0.2"/></actuator>
+</mujoco>
+"""
+LOG = 'model = "robot.xml"\n[channels."q.hinge"]\nunit = "rad"\n[inputs."u.m"]\nunit = "rad"\n'
+
+
+def written(folder, more, column="on", cells=("1", "1", "0", "0", "1")):
+    """The path of a log of two equal runs."""
+    rows = [f"run,t,u.m,q.hinge,{column}" if column else "run,t,u.m,q.hinge"]
+    for run in "ab":
+        for k, cell in enumerate(cells):
+            rows.append(f"{run},{k},0.1,0.{k}" + (f",{cell}" if column else ""))
+    (folder / "robot.xml").write_text(ROBOT)
+    (folder / "log.csv").write_text("\n".join(rows) + "\n")
+    (folder / "log.toml").write_text(LOG + more)
+    return folder / "log.csv"
+
+
+@pytest.mark.parametrize(
+    ("more", "cells", "off"),
+    [
+        ('[actuators.m]\nenable = "on"\n', "11001", "00110"),
+        ('[actuators.m]\ndisable = "on"\n', "11001", "11001"),
+        ('[actuators.m]\nenable = "on"\n[extra.on]\nunit = "1"\n', "20030", "01101"),
+        # A missing cell is as the one before it, and at the beginning as the first.
+        ('[actuators.m]\nenable = "on"\n', ("", "1", "0", "", "1"), "00110"),
+        ('[actuators.m]\nenable = "on"\n', "11111", None),
+    ],
+)
+def test_samples_in_which_a_drive_is_off(tmp_path, more, cells, off):
+    recording, kind = load(written(tmp_path, more, cells=cells), divide=False)
+    for run in recording.runs:
+        assert run.times.size == len(cells)
+        if off is None:
+            assert not run.off
+        else:
+            assert "".join(str(int(value)) for value in run.off["m"]) == off
+    assert len(recording.notes) == (off is not None)
+    assert set(recording.notes) <= set(summary(recording, kind))
+    # The table adds no actuator.
+    assert recording.model.actuators == {}
+    assert [actuator.name for actuator in kind.robot.actuators] == ["m"]
+
+
+def test_the_message_says_where_and_why(tmp_path):
+    recording, _ = load(written(tmp_path, '[actuators.m]\nenable = "on"\n'), divide=False)
+    assert recording.notes == (
+        "actuator m exerts nothing where on is 0: run a, 2 to 3 s; run b, 2 to 3 s",
+    )
+
+
+def test_an_actuator_of_the_recording_may_have_a_switch(tmp_path):
+    more = (
+        '[actuators.s]\njoint = "hinge"\nkind = "velocity"\nkv = 0.5\nenable = "on"\n'
+        '[inputs."u.s"]\nunit = "rad/s"\n'
+    )
+    path = written(tmp_path, more)
+    text = path.read_text().replace("u.m,", "u.m,u.s,").replace(",0.1,", ",0.1,0.0,")
+    path.write_text(text)
+    recording, kind = load(path, divide=False)
+    assert list(recording.runs[0].off) == ["s"]
+    assert [actuator.name for actuator in kind.robot.actuators] == ["m", "s"]
+
+
+def test_parts_of_a_run_keep_their_own_samples(tmp_path):
+    recording, _ = load(written(tmp_path, '[actuators.m]\nenable = "on"\n'), divide=False)
+    part = recording.runs[0].part(slice(2, 5))
+    assert part.off["m"].tolist() == [True, True, False]
+    assert np.array_equal(part.times, [2, 3, 4])
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ('[actuators.x]\nenable = "on"\n', r"unknown actuator 'x'; there are: m"),
+        (
+            '[actuators.m]\nenable = "on"\ndisable = "on"\n',
+            r"expected enable or disable, found both",
+        ),
+        ("[actuators.m]\nenable = 1\n", r"actuators.m.enable: expected the name of a column"),
+        ('[actuators.m]\nenable = "u.m"\n', r"found u.m, which is a channel or input"),
+        ('[actuators.m]\nenable = "of"\n', r"expected column 'of'"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, more, message):
+    with pytest.raises(InputError, match=message) as error:
+        load(written(tmp_path, more), divide=False)
+    assert "\n" not in str(error.value)
+
+
+def test_a_drive_that_is_never_on_is_refused(tmp_path):
+    path = written(tmp_path, '[actuators.m]\nenable = "on"\n', cells="00000")
+    with pytest.raises(InputError, match=r"on is 0 in all samples: actuator m is never on"):
+        load(path, divide=False)
+
+
+def test_logs_have_no_such_column(tmp_path):
+    more = '[actuators.m]\nenable = "on"\n[time]\ncolumn = "t"\n'
+    with pytest.raises(InputError, match=r"column on: expected it in the table beside"):
+        load(written(tmp_path, more), divide=False)
