@@ -216,8 +216,8 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
         "files": [*paths, made],
     }
     if options.ranges:
-        found = [one.document() for one in explanation.ranges.ranges]
-        document["ranges"] = {"ranges": found, "left_out": left_out}
+        document["ranges"] = [one.document() for one in explanation.ranges.ranges]
+        document["ranges_left_out"] = left_out
     interrupted = cut is not None and cut.by == "interrupt"
     return Answer(document, INTERRUPTED if interrupted else DONE)
 

@@ -14,7 +14,8 @@ WIDTH = 96
 
 def literal(text: str) -> str:
     """A text from a file as a Python literal in ASCII: it cannot end early or become code."""
-    return ascii(text)
+    plain = not {"'", '"'} & set(text)
+    return f'"{ascii(text)[1:-1]}"' if plain else ascii(text)
 
 
 def number(value: float) -> str:
