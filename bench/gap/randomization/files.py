@@ -24,7 +24,8 @@ COLUMNS = (
 def range_files(
     ranges: RandomizationRanges, extended: Extended, folder: Path | None = None
 ) -> Mapping[str, str]:
-    """Return the content of each file by its name; none where there is no range.
+    """Return the content of each file by its name: none where there is no range, and no code where
+    no field of the model holds a number.
 
     Args:
         ranges: to write.
@@ -45,10 +46,12 @@ def range_files(
         "ranges": rows,
     }
     table = [[_cell(row.get(column)) for column in COLUMNS] for row in rows]
+    tables = {"ranges.toml": tomli_w.dumps(document), "ranges.csv": csv_text(COLUMNS, table)}
+    if not any(one.fields for one in ranges.ranges):
+        return tables
     robot = getattr(extended.kind, "robot", None)
     return {
-        "ranges.toml": tomli_w.dumps(document),
-        "ranges.csv": csv_text(COLUMNS, table),
+        **tables,
         "ranges_isaac_lab.py": isaac_lab_code(ranges, extended, robot),
         "ranges_mujoco_playground.py": mujoco_playground_code(ranges, extended, robot),
     }

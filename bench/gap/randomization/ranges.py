@@ -23,6 +23,10 @@ NOTHING_FOUND = (
     "no ranges are written: the verdict is {verdict}, and neither a named cause nor a free number "
     "has a finite interval"
 )
+NO_FIELD = (
+    "no code for Isaac Lab and MuJoCo Playground is written: no field of the model holds the "
+    "numbers of ranges.toml; set them in your environment"
+)
 
 
 @dataclass(frozen=True)
@@ -149,6 +153,8 @@ def randomization_ranges(answer: Verdict, extended: Extended) -> RandomizationRa
                 left_out += [why] if is_free or fitted.value or fitted.at_bound else []
             else:
                 ranges.append(_range(kind.robot, totals, number, entry))
+    if ranges and not any(one.fields for one in ranges):
+        left_out.append(NO_FIELD)
     if not ranges:
         left_out.append(NOTHING_FOUND.format(verdict=answer.verdict))
     return RandomizationRanges(tuple(ranges), tuple(left_out))

@@ -1,12 +1,14 @@
 """Ranges for domain randomisation: what they hold, what is left out, and code that runs."""
 
 import csv
+import json
 import re
 import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import jsonschema
 import mujoco
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from bench.gap.randomization.files import COLUMNS, range_files
 from bench.gap.report import pictures
 from bench.gap.verdict import Verdict
 from bench.registry import robot
+from bench.schemas import schema
 from sims.extended import Extended, Number, robot_of
 from sims.user_toml import tomllib
 from tests.bench.gap.stories import answer, story
@@ -24,6 +27,7 @@ from tests.sims.robot.arms import ARM
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "robot"
 NAMES = ("ranges.toml", "ranges.csv", "ranges_isaac_lab.py", "ranges_mujoco_playground.py")
+RANGES_SCHEMA = schema("explain")["anyOf"][0]["properties"]["ranges"]
 RUBS = "friction.coulomb@*"
 
 
@@ -174,6 +178,23 @@ def test_compensated_gravity_has_no_range(arm):
     found = explanation_of(arm, {"gravity.scale": one(-1.0, 0.001)})
     assert found.ranges.ranges == ()
     assert "gravcomp" in found.ranges.left_out[0]
+
+
+def test_numbers_without_a_field_are_a_table_without_code(arm):
+    found = explanation_of(arm, {"input.delay@m_elbow": one(0.02, 0.002)})
+    assert list(range_files(found.ranges, found.extended)) == ["ranges.toml", "ranges.csv"]
+    (line,) = found.ranges.left_out
+    assert line.startswith("no code for Isaac Lab and MuJoCo Playground is written")
+
+
+@pytest.mark.parametrize("effect", [name for name in EFFECTS if name != "input.delay@m_elbow"])
+def test_the_code_of_each_effect_alone_runs(arm, effect):
+    found = explanation_of(arm, {effect: EFFECTS[effect]})
+    files = range_files(found.ranges, found.extended)
+    model, axes = randomized(files["ranges_mujoco_playground.py"], arm.robot.compiled)
+    assert model._values
+    assert set(axes._values) == set(model._values)
+    events(files["ranges_isaac_lab.py"])
 
 
 def test_a_system_without_a_model_file_is_said():
@@ -415,12 +436,16 @@ def test_names_from_files_do_not_become_code(tmp_path):
 def test_the_command_writes_ranges_of_the_example(tmp_path, capsys):
     out = tmp_path / "out"
     log = str(EXAMPLE / "log.csv")
-    assert main(["explain", log, "--out", str(out), "--ranges", "--jobs", "1"]) == 0
-    said = capsys.readouterr().out
+    arguments = ["explain", log, "--out", str(out), "--ranges", "--jobs", "1", "--json"]
+    assert main(arguments) == 0
+    said = json.loads(capsys.readouterr().out)
     for name in NAMES:
+        assert str(out / name) in said["files"]
         assert (out / name).exists()
-        assert str(out / name) in said
+    jsonschema.validate(said["ranges"], RANGES_SCHEMA)
+    assert said["ranges_left_out"] == []
     (found,) = tomllib.loads((out / "ranges.toml").read_text())["ranges"]
+    assert [found] == said["ranges"]
     assert (found["cause"], found["field"]) == ("friction.coulomb@elbow", "dof_frictionloss")
     assert found["low"] < 0.03 < found["high"]
     model = mujoco.MjModel.from_xml_path(str(out / "extended.xml"))
