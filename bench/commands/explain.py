@@ -114,6 +114,13 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="with --each: on the Dask cluster with this scheduler, which must see the same files",
     )
+    parser.add_argument(
+        "--ranges",
+        action="store_true",
+        help="for a robot: also write ranges for domain randomisation, the 95 %% intervals of what "
+        "its model file then has, as ranges.toml, ranges.csv and code for Isaac Lab and MuJoCo "
+        "Playground",
+    )
     add_pdf(parser)
     add_plugin(parser, "systems")
     add_force(parser)
@@ -154,6 +161,11 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
 
     if options.cluster and not options.each:
         raise InputError("--cluster: expected --each beside it, as it is for many recordings")
+    if options.ranges and options.each:
+        raise InputError(
+            "--ranges: not possible together with --each; explain the recordings together, or one "
+            "by one"
+        )
     load_plugins(options.plugin)
     if options.each:
         return _explain_each(options, say)
@@ -183,12 +195,13 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
             )
         display.finish("drawing the figures and writing the report")
         folder = options.out or stamped(Path("results"), f"explain-{options.recordings[0].stem}")
-        paths = explanation.write(folder, pdf=options.pdf)
+        paths = explanation.write(folder, pdf=options.pdf, ranges=options.ranges)
     settings = {name: getattr(options, name) for name in _SETTINGS}
     made = write_explained(folder, started, settings, options.recordings)
     for line in account(explanation.story):
         say(line)
-    for line in explanation.unsaid:
+    left_out = explanation.ranges.left_out if options.ranges else ()
+    for line in (*explanation.unsaid, *left_out):
         say(line)
     say(f"\nreport  {paths[-1]}")
     for path in paths:
@@ -202,6 +215,9 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
         "folder": folder,
         "files": [*paths, made],
     }
+    if options.ranges:
+        document["ranges"] = [one.document() for one in explanation.ranges.ranges]
+        document["ranges_left_out"] = left_out
     interrupted = cut is not None and cut.by == "interrupt"
     return Answer(document, INTERRUPTED if interrupted else DONE)
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from bench.figures.formats import pdf_figures
 from bench.gap.causes.rules import VerdictName
+from bench.gap.randomization.ranges import RandomizationRanges, randomization_ranges
 from bench.gap.report import pictures
 from bench.gap.report.account import closes, cut, interval
 from bench.gap.report.agreement import HEAD, rows
@@ -22,6 +20,7 @@ from bench.gap.report.story import Story
 from bench.gap.report.words import clean, estimated, joined, percent
 from bench.gap.robot_files import RobotFiles, robot_files
 from bench.gap.verdict import Cause, Verdict
+from bench.pages.csv_text import csv_text
 from bench.pages.elements import framed
 from sims import extended as extending
 from sims.arguments import check_arguments
@@ -76,7 +75,7 @@ class Explanation:
         return pictures.figure(self.story, name)
 
     @check_arguments
-    def write(self, folder: str | Path, *, pdf: bool = False) -> list[Path]:
+    def write(self, folder: str | Path, *, pdf: bool = False, ranges: bool = False) -> list[Path]:
         """Write verdict.json, extended.toml, the figures and report.html: all of them or none. Of
         several runs also apart.csv, and for a robot extended.xml, and extended.urdf for one from a
         URDF, after extended.toml.
@@ -86,6 +85,8 @@ class Explanation:
         Args:
             folder: to write to.
             pdf: write each figure as PDF too, in addition to PNG.
+            ranges: also write the ranges for domain randomisation (`ranges`), if there are any:
+                ranges.toml, ranges.csv, ranges_isaac_lab.py and ranges_mujoco_playground.py.
 
         Returns:
             The files in the order above, each figure as PNG before PDF.
@@ -103,6 +104,12 @@ class Explanation:
         if apart := rows(self.story):
             contents[folder / "apart.csv"] = csv_text(HEAD, apart)
         contents |= {folder / name: text for name, text in self._robot_files.contents.items()}
+        if ranges:
+            # Loaded for those who ask alone.
+            from bench.gap.randomization.files import range_files
+
+            found = range_files(self.ranges, self.extended, folder)
+            contents |= {folder / name: text for name, text in found.items()}
         for name, figure in figures.items():
             contents[folder / f"{name}.png"] = figure.png
             if figure.pdf is not None:
@@ -115,6 +122,13 @@ class Explanation:
         except OSError as error:
             raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
         return list(contents)
+
+    @cached_property
+    def ranges(self) -> RandomizationRanges:
+        """The ranges for domain randomisation: of each fitted number of a robot's named causes, and
+        of each free number, the 95 % interval of what the model file then has.
+        """
+        return randomization_ranges(self.answer, self.extended)
 
     @property
     def unsaid(self) -> tuple[str, ...]:
@@ -157,20 +171,6 @@ class Explanation:
         """The report for a notebook's cell, in a frame of its own so that its styles stay there."""
         # Nothing lies beside a cell: no file is named.
         return framed(page(self._told, pictures.printed(self.story)))
-
-
-def csv_text(head: Sequence[str], found: Iterable[Sequence[object]]) -> str:
-    """A table with these columns."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    # What begins like a formula is one to a spreadsheet; names are from files.
-    writer.writerows([_plain(cell) for cell in row] for row in found)
-    return text.getvalue()
-
-
-def _plain(cell: object) -> object:
-    return f"'{cell}" if isinstance(cell, str) and cell.startswith(("=", "+", "-", "@")) else cell
 
 
 def _in_words(cause: Cause) -> str:

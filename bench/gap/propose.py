@@ -6,19 +6,22 @@ Biometrika 62(1), 57, 1975, doi:10.1093/biomet/62.1.57), the rival's parameters 
 data made of them. Of a run x with T samples of C channels the two models differ by
 
     apart(x) = sqrt(mean over t, c of ((y_model - y_rival) / sigma_c)^2)                       (1)
+
+Of a robot no run is proposed that exceeds a limit of the model file (`bench.gap.rig`): commands and
+initial states keep to it, and the motion is simulated with both models.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bench.gap.model.models import Model, Models
-from bench.gap.model.tracks import Track
 from bench.gap.model.world import World
+from bench.gap.rig.stated_limits import UNLIMITED, Interval, StatedLimits, stated_limits
 from sims.base import Array, Scenario
 
 TELLING = 2.0
@@ -33,6 +36,10 @@ LOWEST = 1.0
 """Height in metres from which what bounces is let go, at least."""
 INPUTS = (0.3, 3.0)
 """Shares of an input that are tried in its place."""
+ROBOT_INPUTS = (0.3, 2.0)
+"""Shares of a robot's input likewise: it may be driven twice as hard as so far."""
+LARGER = 1.1
+"""Share of an input from which it is called larger, and below whose reciprocal smaller."""
 
 
 @dataclass(frozen=True)
@@ -78,30 +85,68 @@ def next_experiment(models: Models, model: Model, rival: Model) -> Experiment:
     says = ""
     change: dict[str, float] = {}
     largest = 0.0
-    for run in _runs(world):
-        apart = _apart(world, run, model, rival, models.noise.sigma)
-        # A run on which one of the simulations fails proposes nothing.
-        if np.isfinite(apart) and apart > largest:
-            says, change, largest = run.says, run.change, apart
+    apart = [(_apart(world, run, model, rival, models.noise.sigma), run) for run in _runs(world)]
+    # A run on which one of the simulations fails proposes nothing.
+    apart = [(size, run) for size, run in apart if np.isfinite(size) and size > 0.0]
+    apart.sort(key=lambda entry: -entry[0])
+    is_limited = False
+    if found := _first_within_limits(world, (model, rival), apart):
+        largest, (says, change, _, _) = found
+        is_limited = largest < TELLING <= apart[0][0]
     # Effects that both have are no matter of dispute.
     names = set(model.names)
     rivals = set(rival.names)
     mine = " and ".join(sorted(names - rivals))
     other = " and ".join(sorted(rivals - names))
     if largest < TELLING:
-        return Experiment(_no_run(world, mine, other), {}, largest)
+        return Experiment(_no_run(world, mine, other, is_limited), {}, largest)
     says = f"{says}: there {mine} and {other} differ by {largest:.3g} times the noise"
     return Experiment(says, change, largest)
 
 
-def _no_run(world: World, mine: str, other: str) -> str:
-    """What to do where no run of this kind would tell."""
+def _first_within_limits(
+    world: World, models: Sequence[Model], runs: Sequence[tuple[float, _Run]]
+) -> tuple[float, _Run] | None:
+    """The first of some runs that stays within the limits of a robot, whichever model is true; the
+    first of all for a system without a model file.
+
+    Args:
+        world: of the runs so far.
+        models: that may be true.
+        runs: each with the difference of the models on it, (1), largest first.
+
+    Returns:
+        A run with its difference, 0 where no run that tells the models apart is within the limits;
+        None without runs.
+    """
+    if not world.kind.has_model or not runs or runs[0][0] < TELLING:
+        return runs[0] if runs else None
+    # Loaded for robots alone.
+    from bench.gap.rig.limits import Limits
+    from bench.gap.rig.plans import Plan
+    from bench.gap.rig.plans import Run as RigRun
+
+    limits = Limits(world, models[0])
+    for apart, run in runs:
+        candidate = RigRun(Plan(), run.says, run.scenario, run.states)
+        if apart < TELLING or all(limits(model, [candidate])[0] for model in models):
+            return apart, run
+    return 0.0, runs[0][1]
+
+
+def _no_run(world: World, mine: str, other: str, is_limited: bool) -> str:
+    """What to do where no run of this kind would tell, or none within the limits of a robot."""
     channels = [channel.name for channel in world.kind.channels]
     unseen = ", ".join(name for name in channels if name not in world.channels)
     instead = "measure one of the causes directly"
     # What another sensor sees may differ where these agree.
     if unseen:
         instead = f"record {unseen} besides"
+    if is_limited:
+        return (
+            f"No run of this kind within the limits of the model file would tell {mine} from "
+            f"{other}; {instead}, or let simgap design search for other commands"
+        )
     return (
         f"No run of this kind would tell {mine} from {other}: "
         f"their predictions agree within the noise; {instead}"
@@ -110,58 +155,104 @@ def _no_run(world: World, mine: str, other: str) -> str:
 
 def _runs(world: World) -> Iterator[_Run]:
     """Runs like the first one, with more or less of what an experimenter has in hand."""
+    limits = stated_limits(world)
+    first = _first(world, limits)
     # Of runs that tell as much the first one is proposed.
+    yield _longer(first)
+    yield from _elsewhere(world, first, limits)
+    yield from _driven(world, first, limits)
+
+
+def _first(world: World, limits: StatedLimits) -> _Run:
+    """The first run that was fitted; of a robot from rest (nobody can throw it), and with commands
+    and positions within their limits.
+    """
     track = world.tracks[0]
-    yield _longer(track)
-    yield from _elsewhere(world, track)
-    yield from _driven(track)
+    if not world.kind.has_model:
+        return _Run("", {}, track.scenario, track.guess)
+    rates = set(world.simulator.system.rates)
+    states = [
+        0.0 if name in rates else _limited(value, limits.states.get(name))
+        for name, value in zip(world.states, track.guess, strict=True)
+    ]
+    given = track.scenario.inputs
+    inputs = {name: _limited(values, limits.commands.get(name)) for name, values in given.items()}
+    is_limited = any((inputs[name] != values).any() for name, values in given.items())
+    says = ", with commands limited as the model file states" if is_limited else ""
+    return _Run(says, {}, replace(track.scenario, inputs=inputs), np.array(states))
 
 
-def _longer(track: Track) -> _Run:
-    times = track.scenario.times
+def _limited(values: Any, limits: Interval | None) -> Any:
+    """A number, or several, within an interval."""
+    return values if limits is None else np.clip(values, *limits)
+
+
+def _longer(first: _Run) -> _Run:
+    times = first.scenario.times
     later = times[1:] - times[0]
     twice = np.concatenate([times, times[-1] + later])
     inputs = {}
-    for name, signal in track.scenario.inputs.items():
+    for name, signal in first.scenario.inputs.items():
         # The inputs are given once more from the beginning.
         inputs[name] = np.concatenate([signal, signal[1:]])
-    scenario = replace(track.scenario, times=twice, inputs=inputs)
+    scenario = replace(first.scenario, times=twice, inputs=inputs)
     seconds = float(twice[-1] - twice[0])
     change = {"seconds": seconds}
-    return _Run("Record twice as long", change, scenario, track.guess)
+    return _Run(f"Record twice as long{first.says}", change, scenario, first.states)
 
 
-def _elsewhere(world: World, track: Track) -> Iterator[_Run]:
-    """Started from elsewhere, one state at a time."""
+def _elsewhere(world: World, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
+    """Started from elsewhere, one state at a time; a robot at rest."""
     system = world.simulator.system
     height = len(system.coordinates) - 1
     named = zip(world.states, _units(world), strict=True)
     for place, (name, unit) in enumerate(named):
         above_ground = system.bounces and place == height
+        if world.kind.has_model and name not in system.coordinates:
+            continue
         for share in STARTS:
             # Nothing is let go below the ground.
             if above_ground and share < 0:
                 continue
-            states = track.guess.copy()
+            states = first.states.copy()
             value = float(states[place])
             moving = abs(value) > AT_REST
             value = share * value if moving else share
             if above_ground:
                 value = max(value, LOWEST)
+            value = float(_limited(value, limits.states.get(name)))
             states[place] = value
-            says = f"Start with {name} = {value:.3g} {unit}"
-            yield _Run(says, {name: value}, track.scenario, states)
+            says = f"Start with {name} = {value:.3g} {unit}{first.says}"
+            yield _Run(says, {name: value}, first.scenario, states)
 
 
-def _driven(track: Track) -> Iterator[_Run]:
-    """Driven more or less, one input at a time."""
-    for name, signal in track.scenario.inputs.items():
-        for share in INPUTS:
-            inputs = {**track.scenario.inputs, name: share * signal}
+def _driven(world: World, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
+    """Driven more or less, one input at a time, within the limits of the commands."""
+    shares = ROBOT_INPUTS if world.kind.has_model else INPUTS
+    for name, signal in first.scenario.inputs.items():
+        if not signal.any():
+            continue
+        low, high = limits.commands.get(name, UNLIMITED)
+        most = _largest_share(signal, (low, high))
+        for share in dict.fromkeys(min(share, most) for share in shares):
+            driven = share * signal
+            if 1.0 / LARGER < share < LARGER or driven.min() < low or driven.max() > high:
+                continue
+            inputs = {**first.scenario.inputs, name: driven}
             size = "smaller" if share < 1 else "larger"
-            says = f"Make the input {name} {size}, {share:g} times what it was"
-            scenario = replace(track.scenario, inputs=inputs)
-            yield _Run(says, {name: share}, scenario, track.guess)
+            says = f"Make the input {name} {size}, {share:.3g} times what it was{first.says}"
+            scenario = replace(first.scenario, inputs=inputs)
+            yield _Run(says, {name: share}, scenario, first.states)
+
+
+def _largest_share(signal: Array, limits: Interval) -> float:
+    """The factor up to which a signal stays within its limits, rounded down; infinite where
+    nothing limits it.
+    """
+    ends = zip((float(signal.min()), float(signal.max())), limits, strict=True)
+    # A limit on the other side of zero is not reached by any factor.
+    factors = [limit / end for end, limit in ends if np.isfinite(limit) and end * limit > 0]
+    return float(np.floor(1e3 * min(factors)) / 1e3) if factors else np.inf
 
 
 def _units(world: World) -> list[str]:

@@ -173,7 +173,7 @@ def _scale_stiffness(fields: Fields, robot: Robot, place: str, c: Array) -> None
     number = robot.actuator(place).id
     gain, bias = fields["actuator_gainprm"][:, number], fields["actuator_biasprm"][:, number]
     bias[:, 1] *= share(c[0])
-    if _gain_pulls(robot, number, 1):
+    if gain_pulls(robot, number, 1):
         gain[:, 0] *= share(c[0])
 
 
@@ -181,11 +181,11 @@ def _scale_damping(fields: Fields, robot: Robot, place: str, c: Array) -> None:
     number = robot.actuator(place).id
     gain, bias = fields["actuator_gainprm"][:, number], fields["actuator_biasprm"][:, number]
     bias[:, 2] *= share(c[0])
-    if _gain_pulls(robot, number, 2):
+    if gain_pulls(robot, number, 2):
         gain[:, 0] *= share(c[0])
 
 
-def _gain_pulls(robot: Robot, number: int, term: int) -> bool:
+def gain_pulls(robot: Robot, number: int, term: int) -> bool:
     """Whether an actuator's control is a set point of its position (term 1) or velocity (2)."""
     import mujoco
 

@@ -94,17 +94,21 @@ class UrdfWriter:
         tag.before.append(cause.told(self.recording))
 
     def _inertials(self, cause: Cause) -> list[tuple[str, Tag]] | None:
-        """The links of a body with their inertials; None where one has none."""
+        """The links of a body that have a mass, with their inertials; None where the mass of a link
+        follows from its shapes, or no link has one.
+
+        A link without mass, as a frame that carries others on fixed joints, adds nothing.
+        """
         body = self.robot.body(cause.place)
         found = []
         for name in (body.name, *body.aliases):
             link = self.links.get(name)
             inertial = _child(link, "inertial") if link else None
             if inertial is not None:
-                found.append((name, inertial))
-            elif link is None or _child(link, "collision") or name == body.name:
+                found += [(name, inertial)] if _has_mass(inertial) else []
+            elif link is None or _child(link, "collision"):
                 return None
-        return found
+        return found or None
 
     def _mass(self, cause: Cause) -> str | None:
         inertials = self._inertials(cause)
@@ -161,6 +165,12 @@ def _names(joint: Tag, end: str) -> str:
     """The link at an end of a joint."""
     found = _child(joint, end)
     return (found.says("link") or "") if found else ""
+
+
+def _has_mass(inertial: Tag) -> bool:
+    """Whether an inertial states a mass or a moment of inertia other than zero."""
+    stated = ((_child(inertial, "mass"), ("value",)), (_child(inertial, "inertia"), _TENSOR))
+    return any(float(tag.says(key) or 0.0) for tag, keys in stated if tag for key in keys)
 
 
 def _scale(inertial: Tag, name: str, attributes: tuple[str, ...], factor: float) -> None:

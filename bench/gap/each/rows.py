@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bench.gap.explanation import csv_text
+from bench.pages.csv_text import csv_text
 
 TABLE = "logs.csv"
 """The table: a row for each number of each cause of each log."""

@@ -1,8 +1,8 @@
 """What a rig must not be made to do: leave its joints' ranges, go faster or pull harder than it
 may, touch what it did not touch; by simulation, with all that moves watched, recorded or not.
 
-What a model file states is its limit (a URDF's speed; forces are clamped by the simulation where
-they are limited). What nothing states is limited by what the runs so far did themselves.
+What a model file states is its limit (`bench.gap.rig.stated_limits`), whatever the runs so far did.
+What nothing states is limited by what the runs so far did themselves.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from bench.gap.model.models import Model
 from bench.gap.model.world import World
 from bench.gap.rig.plans import Run
+from bench.gap.rig.stated_limits import Interval, stated_limits
 from bench.recordings.poses import contacts
 from sims.base import Array, Scenario
 
@@ -24,6 +25,10 @@ TRAVEL = 3.0
 """Times the range so far that a channel may leave it, where nothing states its limits."""
 FASTER = 2.0
 """Times the fastest, and the strongest, so far that a robot may be where nothing states it."""
+STOP = 0.01
+"""Share of its range by which a joint may press into its stop, where it did so in the runs so far:
+stops are soft in MuJoCo.
+"""
 IDLE = 0.1
 """Of the fastest, and the strongest, of all joints: what a joint may be that was at rest so far."""
 
@@ -104,12 +109,11 @@ class Limits:
         scales = {channel.name: channel.scale for channel in self.world.kind.channels}
         if not self.world.kind.has_model:
             return {name: _wider(*ends[name], scales[name]) for name in ends}
-        stated = self._stated()
+        stated = stated_limits(self.world).channels
         bounds = {}
         for name, (low, high) in ends.items():
             if name in stated:
-                # What the runs so far did they may do again, whatever the file says.
-                bounds[name] = min(stated[name][0], low), max(stated[name][1], high)
+                bounds[name] = _with_stop(stated[name], (low, high), name.startswith("q."))
             elif name.startswith("q."):
                 bounds[name] = _wider(low, high, scales[name])
             else:
@@ -118,21 +122,6 @@ class Limits:
                 own = FASTER * max(abs(low), abs(high), IDLE * most)
                 bounds[name] = -own, own
         return bounds
-
-    def _stated(self) -> dict[str, tuple[float, float]]:
-        """What the model file states of them."""
-        robot: Any = self.world.kind
-        found = {f"q.{joint.name}": joint.range for joint in self._joints if joint.range}
-        for name, speed in robot.robot.speeds.items():
-            found[f"qd.{name}"] = (-speed, speed)
-        for joint in self._joints:
-            drives = [a for a in robot.robot.actuators if a.joint == joint.name]
-            clamped = bool(drives) and all(a.force is not None for a in drives)
-            if joint.effort is not None:
-                found[f"tau.{joint.name}"] = (-joint.effort, joint.effort)
-            elif clamped:
-                found[f"tau.{joint.name}"] = (-np.inf, np.inf)
-        return found
 
     def _within(self, channels: Mapping[str, Array]) -> bool:
         for name, values in channels.items():
@@ -148,6 +137,15 @@ class Limits:
     def _touched(self) -> frozenset[tuple[int, int]]:
         """What touched in the runs so far."""
         return frozenset().union(*(contacts(self.world.kind, run) for run in self.past))
+
+
+def _with_stop(stated: Interval, past: Interval, is_position: bool) -> Interval:
+    """Stated limits; of a position with what the joint pressed into its stops, a little at most."""
+    low, high = stated
+    if not is_position:
+        return stated
+    slack = STOP * (high - low)
+    return max(min(low, past[0]), low - slack), min(max(high, past[1]), high + slack)
 
 
 def _wider(low: float, high: float, scale: float) -> tuple[float, float]:

@@ -4,13 +4,13 @@ about which level, from where, with which load, at which rate.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from bench.gap.model.world import World
+from bench.gap.rig.stated_limits import UNLIMITED, stated_limits
 from bench.problem.signals import signal
 from sims.base import Array, Scenario
 
@@ -86,15 +86,20 @@ class Rig:
             self.largest[name] = max(float(np.abs(values - middle).max()) for values in signals)
             self.rest[name] = middle
         self.driven = tuple(name for name in self.old.inputs if self.largest[name] > 0)
-        self.ranges = _ranges(world)
+        self.limits = stated_limits(world)
         self.begin = self._begin()
 
     def _begin(self) -> Array:
-        """Where the first run began, at rest: nobody can throw a robot."""
+        """Where the first run began, at rest (nobody can throw a robot) and within joint ranges."""
         states = self.world.tracks[0].guess.copy()
         rates = set(self.world.simulator.system.rates)
-        states[[i for i, name in enumerate(self.world.states) if name in rates]] = 0.0
+        for i, name in enumerate(self.world.states):
+            states[i] = 0.0 if name in rates else self._reachable(name, float(states[i]))
         return states
+
+    def _reachable(self, name: str, value: float) -> float:
+        """The value of a state within the joint's range."""
+        return float(np.clip(value, *self.limits.positions.get(name, UNLIMITED)))
 
     # -- plans
 
@@ -131,8 +136,10 @@ class Rig:
         unseen = {world.states[i] for i in np.flatnonzero(world.known.all(axis=0))}
         for name in system.coordinates:
             base = float(self.begin[world.states.index(name)])
-            for share in SHARES if name not in unseen else ():
-                value = share * base if abs(base) > AT_REST else share
+            values = [share * base if abs(base) > AT_REST else share for share in SHARES]
+            # Beyond its range a joint begins at the end of it, which need not be tried twice.
+            reachable = dict.fromkeys(self._reachable(name, value) for value in values)
+            for value in reachable if name not in unseen else ():
                 yield name, value
         if world.kind.has_model:
             return
@@ -154,23 +161,28 @@ class Rig:
     def run(self, plan: Plan) -> Run:
         """The commands of a plan."""
         times = np.arange(0.0, self.seconds, self.step * plan.coarser)
-        inputs = {name: np.full(times.size, self.rest[name]) for name in self.old.inputs}
+        inputs = {
+            name: self._limited(name, np.full(times.size, self.rest[name]))
+            for name in self.old.inputs
+        }
         states = self.begin.copy()
+        limited = []
         for number, name in enumerate(plan.driven):
             own = plan.size * _command(plan.form, times, self.step, np.random.default_rng(number))
-            own += plan.level
-            inputs[name] = self._limited(name, self.rest[name] + self.largest[name] * own)
+            wanted = self.rest[name] + self.largest[name] * (own + plan.level)
+            inputs[name] = self._limited(name, wanted)
+            limited += [name] if (inputs[name] != wanted).any() else []
         for name, value in plan.states:
             states[self.world.states.index(name)] = value
         constants = {**self.old.constants, **dict(plan.constants)}
         scenario = replace(self.old, times=times, inputs=inputs, constants=constants)
-        return Run(plan, self._says(plan, inputs), scenario, states)
+        return Run(plan, self._says(plan, inputs, limited), scenario, states)
 
     def _limited(self, name: str, values: Array) -> Array:
-        """A command within what its actuator, or its joint, takes."""
-        return np.asarray(np.clip(values, *self.ranges[name])) if name in self.ranges else values
+        """A command within the limits of its actuator and its joint."""
+        return np.asarray(np.clip(values, *self.limits.commands.get(name, UNLIMITED)))
 
-    def _says(self, plan: Plan, inputs: Mapping[str, Array]) -> str:
+    def _says(self, plan: Plan, inputs: Mapping[str, Array], limited: Sequence[str]) -> str:
         if plan.driven:
             what = plan.driven[0] if len(plan.driven) == 1 else "all inputs"
             text = f"{what}: {plan.form}, {plan.size:g} times as large as so far"
@@ -179,6 +191,9 @@ class Rig:
         if plan.level:
             middles = [f"{name} = {np.median(inputs[name]):.3g}" for name in plan.driven]
             text += f", about {', '.join(middles)}"
+        for name in limited:
+            low, high = self.limits.commands[name]
+            text += f", {name} limited to {low:.4g} to {high:.4g}"
         begins = [f"{name} = {value:.3g}" for name, value in plan.states]
         text += f", from {', '.join(begins)}" if begins else ""
         if plan.constants:
@@ -220,14 +235,3 @@ def _command(form: str, times: Array, step: float, rng: np.random.Generator) -> 
     fast = max(min(8.0, 0.1 / step), 2.0 * slow)
     text = FORMS[form].format(slow=slow, middle=min(1.0, 0.5 * fast), fast=fast)
     return signal(text, times, rng)
-
-
-def _ranges(world: World) -> dict[str, tuple[float, float]]:
-    """What a robot's inputs take, by name."""
-    if not world.kind.has_model:
-        return {}
-    robot: Any = world.kind
-    controls = {f"u.{a.name}": a.range for a in robot.robot.actuators if a.range is not None}
-    efforts = {j.name: j.effort for j in robot.robot.joints if j.effort is not None}
-    forces = {f"force.{name}": (-effort, effort) for name, effort in efforts.items()}
-    return {**controls, **forces}

@@ -82,7 +82,7 @@ def test_what_nothing_states_is_as_fast_and_as_strong_as_it_was(arm):
 def test_commands_keep_to_what_joints_take(arm):
     world, _ = arm(9.0)
     rig = Rig(world, 2.0)
-    assert rig.ranges["force.hip"] == (-30.0, 30.0)
+    assert rig.limits.commands["force.hip"] == (-30.0, 30.0)
     assert np.abs(rig._limited("force.hip", np.array([-50.0, 7.0]))).max() == 30.0
 
 

@@ -243,6 +243,61 @@ def test_a_urdf_says_what_it_can(tmp_path: Path) -> None:
         check(arm, causes, wrong)
 
 
+MASSLESS = """<robot name="arm">
+  <link name="base"/>
+  <link name="fore"INERTIAL
+  <link name="tip"><inertial><mass value="0"/>
+    <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial></link>
+  <link name="tool">
+    <inertial><origin xyz="0.05 0 0.02" rpy="0.3 0 0"/><mass value="0.3"/>
+      <inertia ixx="0.001" ixy="0.0001" ixz="0" iyy="0.002" iyz="0" izz="0.002"/></inertial>
+  </link>
+  <joint name="elbow" type="continuous">
+    <parent link="base"/><child link="fore"/><origin xyz="0 0 1"/><axis xyz="0 1 0"/>
+  </joint>
+  <joint name="frame" type="fixed">
+    <parent link="fore"/><child link="tip"/><origin xyz="0.1 0 0" rpy="0 0 0.4"/>
+  </joint>
+  <joint name="weld" type="fixed">
+    <parent link="tip"/><child link="tool"/><origin xyz="0.2 0 0" rpy="0 0.5 1.0"/>
+  </joint>
+</robot>
+"""
+
+
+@pytest.mark.parametrize("inertial", ["/>", '><inertial><mass value="0"/></inertial></link>'])
+def test_a_urdf_says_what_massless_links_carry(tmp_path: Path, inertial: str) -> None:
+    """A body whose mass is on a link behind fixed joints is changed there."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(MASSLESS.replace("INERTIAL", inertial))
+    arm = read(path)
+    causes: Causes = {
+        "mass.scale@fore": one(0.2),
+        "mass.offset@fore": {"x": number(0.01, "m"), "z": number(0.02, "m")},
+        "inertia.scale@fore": one(0.1),
+    }
+    done = written(arm, causes, "log.csv")
+    check(arm, causes, done)
+    assert done.urdf is not None
+    assert not [line for line in done.said if "not in the URDF" in line]
+    assert '<mass value="0.36"/>' in done.urdf
+    changed = done.urdf.partition('<link name="tool">')[2].partition("</link>")[0]
+    assert changed.count("fitted to log.csv") == done.urdf.count("fitted to log.csv") == 3
+
+
+def test_a_urdf_body_without_any_inertial_is_said(tmp_path: Path) -> None:
+    """Mass that follows from shapes has no number in the file."""
+    shape = '><collision><geometry><sphere radius="0.1"/></geometry></collision></link>'
+    path = tmp_path / "arm.urdf"
+    path.write_text(MASSLESS.replace("INERTIAL", shape))
+    arm = read(path)
+    causes: Causes = {"mass.scale@fore": one(0.2)}
+    done = written(arm, causes, "log.csv")
+    check(arm, causes, done)
+    (line,) = [line for line in done.said if "not in the URDF" in line]
+    assert "states no inertial" in line
+
+
 def test_a_delay_is_that_of_the_simulator(tmp_path: Path) -> None:
     """A control that is delayed by a part of a step is the mean over the step, in both."""
     from sims.base import Scenario

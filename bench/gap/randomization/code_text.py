@@ -1,0 +1,64 @@
+"""Parts of generated Python code that are made of names from files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+
+from bench.pages.text import clean
+from sims.extended import Extended
+
+WIDTH = 96
+"""Characters of a comment line."""
+
+
+def literal(text: str) -> str:
+    """A text from a file as a Python literal in ASCII: it cannot end early or become code."""
+    plain = not {"'", '"'} & set(text)
+    return f'"{ascii(text)[1:-1]}"' if plain else ascii(text)
+
+
+def number(value: float) -> str:
+    """A number as a Python literal, with nine digits."""
+    return repr(float(f"{value:.9g}"))
+
+
+def comment(text: str, indent: str = "") -> Iterator[str]:
+    """Lines of a comment; line breaks and control characters in names are spelled out."""
+    words = clean(text, 2000).split(" ")
+    line = f"{indent}#"
+    for word in words:
+        if len(line) + 1 + len(word) > WIDTH and line != f"{indent}#":
+            yield line
+            line = f"{indent}#"
+        line += f" {word}"
+    yield line
+
+
+def identifiers(names: Iterable[str]) -> Iterator[str]:
+    """An identifier for each name, different from all before it."""
+    used: set[str] = set()
+    for name in names:
+        base = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower() or "range"
+        base = base if base[0].isalpha() else f"n_{base}"
+        found, count = base, 1
+        while found in used:
+            count += 1
+            found = f"{base}_{count}"
+        used.add(found)
+        yield found
+
+
+def heading(extended: Extended, framework: str, left_out: Iterable[str]) -> Iterator[str]:
+    """The first lines of a file: what it is of, and what it lacks."""
+    model = extended.robot.path.name if extended.robot is not None else extended.system
+    yield from comment(
+        f"Domain randomisation for {framework}, written by simgap explain --ranges: robot "
+        f"{model}, recording {extended.title}."
+    )
+    yield from comment(
+        "Each range is the 95 % interval of a number of the model file with the causes that were "
+        "found: how well this recording determines it, not how robots of one kind differ."
+    )
+    for line in left_out:
+        yield from comment(f"Left out: {line}.")

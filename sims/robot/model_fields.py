@@ -1,0 +1,117 @@
+"""Where MuJoCo's compiled model keeps the number that a coefficient changes.
+
+`sims.robot.native` writes these fields, `sims.robot.totals` reads the numbers in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from sims.robot.model import Robot
+from sims.robot.native import gain_pulls
+
+Operation = Literal["abs", "add", "scale"]
+"""How a random number is applied to a field: it replaces, is added to, or multiplies the number."""
+
+
+@dataclass(frozen=True)
+class ModelField:
+    """An element of a field of mujoco.MjModel that holds a number of the model file.
+
+    Attributes:
+        name: of the field, as ``dof_damping``; ``opt.gravity`` of the options.
+        address: index of the element.
+        sign: -1 where the field holds the negative of the number, as the bias of a servo.
+    """
+
+    name: str
+    address: tuple[int, ...]
+    sign: int = 1
+
+
+Find = Callable[[Robot, str], "list[list[ModelField]]"]
+"""The elements of each coefficient, by robot and place."""
+
+
+def _dof(name: str, *index: int) -> Find:
+    return lambda robot, place: [[ModelField(name, (robot.joint(place).velocity, *index))]]
+
+
+def _joint(name: str, *index: int) -> Find:
+    return lambda robot, place: [[ModelField(name, (robot.joint(place).id, *index))]]
+
+
+def _body(name: str) -> Find:
+    return lambda robot, place: [[ModelField(name, (robot.body(place).id,))]]
+
+
+def _center(robot: Robot, place: str) -> list[list[ModelField]]:
+    number = robot.body(place).id
+    return [[ModelField("body_ipos", (number, axis))] for axis in range(3)]
+
+
+def _servo(term: int) -> Find:
+    def find(robot: Robot, place: str) -> list[list[ModelField]]:
+        number = robot.actuator(place).id
+        found = [ModelField("actuator_biasprm", (number, term), -1)]
+        if gain_pulls(robot, number, term):
+            found.insert(0, ModelField("actuator_gainprm", (number, 0)))
+        return [found]
+
+    return find
+
+
+def _force_range(robot: Robot, place: str) -> list[list[ModelField]]:
+    number = robot.actuator(place).id
+    ends = [ModelField("actuator_forcerange", (number, end), (-1, 1)[end]) for end in (1, 0)]
+    return [ends]
+
+
+def _gravity(*axes: int) -> Find:
+    return lambda _robot, _place: [[ModelField("opt.gravity", (axis,))] for axis in axes]
+
+
+_FIELDS: Mapping[str, Find] = {
+    "drag.linear": _dof("dof_damping"),
+    "drag.quadratic": _dof("dof_dampingpoly", 0),
+    "friction.coulomb": _dof("dof_frictionloss"),
+    "inertia.armature": _dof("dof_armature"),
+    "spring.linear": _joint("jnt_stiffness"),
+    "spring.cubic": _joint("jnt_stiffnesspoly", 1),
+    "actuator.limit": _force_range,
+    "actuator.stiffness": _servo(1),
+    "actuator.damping": _servo(2),
+    "mass.scale": _body("body_mass"),
+    "mass.offset": _center,
+    "inertia.scale": _body("body_inertia"),
+    "gravity.scale": lambda _robot, _place: [[ModelField("opt.gravity", ())]],
+    "gravity.tilt": _gravity(0, 1),
+}
+_OPERATIONS: Mapping[str, Operation] = {
+    "mass.offset": "add",
+    "inertia.scale": "scale",
+    "gravity.scale": "scale",
+}
+"""Operations other than ``abs``: a position is moved, a tensor or a vector keeps its direction."""
+
+
+def model_fields(robot: Robot, effect: str, place: str) -> list[list[ModelField]]:
+    """Find the elements of the compiled model that an effect changes, by coefficient.
+
+    Args:
+        robot: whose model.
+        effect: name of the effect, without its place.
+        place: joint, actuator or body.
+
+    Returns:
+        Of each coefficient the elements that hold its number, the main one first; empty where the
+        model has no such number.
+    """
+    return _FIELDS[effect](robot, place) if effect in _FIELDS else []
+
+
+def operation_of(effect: str) -> Operation:
+    """Return how a drawn number is applied to the field of an effect."""
+    return _OPERATIONS.get(effect, "abs")
