@@ -23,6 +23,9 @@ class ActuatorTable(TypedDict, total=False):
     gear: float
     control_range: Pair
     force_range: Pair
+    # Read with the recording (`sims.recording.drive_switches`); here so that messages name them.
+    enable: str
+    disable: str
 
 
 class EngineTable(TypedDict, total=False):

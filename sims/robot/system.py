@@ -273,7 +273,8 @@ def _parameters(effect: type[Effect]) -> list[Parameter]:
         bounds = WIDER * low, GUESSED if guess else WIDER * high
         # What cannot be observed has no range of its own; the data will not fix it.
         if c.least is not None and c.least != c.most:
-            bounds = max(bounds[0], c.least), min(bounds[1], c.most or np.inf)
+            most = np.inf if c.most is None else c.most
+            bounds = max(bounds[0], c.least), min(bounds[1], most)
         name = effect.name if len(effect.coefficients) == 1 else f"{effect.name}.{c.name}"
         unit = c.units[0] or "1"
         result.append(Parameter(name, unit, 0.0, bounds, (low, high), says=effect.says))

@@ -92,6 +92,7 @@ def test_parts_of_a_run_keep_their_own_samples(tmp_path):
             r"expected enable or disable, found both",
         ),
         ("[actuators.m]\nenable = 1\n", r"actuators.m.enable: expected the name of a column"),
+        ('[actuators.m]\nenabel = "on"\n', r"unknown entry .*'enabel'.*did you mean enable\?"),
         ('[actuators.m]\nenable = "u.m"\n', r"found u.m, which is a channel or input"),
         ('[actuators.m]\nenable = "of"\n', r"expected column 'of'"),
     ],

@@ -95,8 +95,8 @@ FAULTS = {
     ),
     "key": (
         {"joint": "elbow", "kind": "motor", "kq": 1},
-        "unknown entry of [actuators.m] in PATH 'kq'; there are: control_range, force_range, gear, "
-        "joint, kd, ki, kind, kp, kv",
+        "unknown entry of [actuators.m] in PATH 'kq'; there are: control_range, disable, "
+        "enable, force_range, gear, joint, kd, ki, kind, kp, kv",
     ),
     "key of another kind": (
         {"joint": "elbow", "kind": "position", "kp": 1, "kd": 1},
