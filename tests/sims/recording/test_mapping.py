@@ -112,7 +112,8 @@ FAULTS = {
     "no unit of time": ({"toml": TOML.replace('"ms"', '"kg"')}, r"time.unit: "),
     "a word too many": ({"toml": TOML.replace("unit = \"ms", "units = \"ms")},
                         r"'units'; there are: column, offset, unit"),
-    "not a table": ({"sensors": ""}, r"sensors.csv: not a table"),
+    "not a table": ({"sensors": ""}, r"sensors.csv: expected a table with a header and rows, found"
+                    r" an empty file"),
 }  # fmt: skip
 
 
