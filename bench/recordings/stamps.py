@@ -61,6 +61,7 @@ def refuse_odd(recording: Recording, kind: type[Simulator], force: bool = False)
     """
     # Positions of a wrong unit make stamps look odd, and not the other way round.
     found = [
+        *(Oddity(note, False) for note in recording.notes),
         *poses.odd_poses(recording, kind),
         *oddities(recording, kind),
         *unplaced(recording, kind),

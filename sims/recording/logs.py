@@ -52,6 +52,7 @@ class Log:
         unlisted: columns that are left out of `names`, since another one holds the same numbers
             under the name of their joint.
         named: whether the file names its columns.
+        first: number of the first of them in the file, for messages.
     """
 
     path: Path
@@ -61,6 +62,7 @@ class Log:
     units: Mapping[str, str] = field(default_factory=dict)
     unlisted: frozenset[str] = frozenset()
     named: bool = True
+    first: int = 2
 
     def column(self, name: str) -> Array:
         """(T,) one column, or one entry of a list.
@@ -194,7 +196,16 @@ def _read(stamp: Stamp) -> Log:
 def _table(path: Path) -> Log:
     """A table whose layout is found out."""
     table = read_text_table(path)
-    return Log(path, table.columns, table.texts, "row", table.units, table.unlisted, table.named)
+    return Log(
+        path,
+        table.columns,
+        table.texts,
+        "row",
+        table.units,
+        table.unlisted,
+        table.named,
+        table.first,
+    )
 
 
 # -- arrays

@@ -117,7 +117,8 @@ class Recording:
     its runs.
 
     `extra` has the units of the columns that belong to no channel or input, such as pixels of a
-    tracked film; `model` the model file where it is of a robot.
+    tracked film; `model` the model file where it is of a robot; `notes` say what was left out of
+    its logs when they were read.
     """
 
     path: Path
@@ -128,6 +129,7 @@ class Recording:
     runs: tuple[Run, ...]
     extra: Mapping[str, str] = field(default_factory=dict)
     model: ModelFile | None = None
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         first = self.runs[0] if self.runs else None
@@ -188,6 +190,7 @@ def read_recording(
         kept,
         about.extra,
         model_in(description, meta),
+        tuple(note for part in parts for note in part.notes),
     )
 
 

@@ -41,6 +41,7 @@ class TextTable:
         units: by column, where a row of the table states them.
         unlisted: columns that another one holds under the name of its joint.
         named: whether the file names its columns.
+        first: line of the first row of data, counted from 1.
     """
 
     columns: Mapping[str, Array]
@@ -48,6 +49,7 @@ class TextTable:
     units: Mapping[str, str] = field(default_factory=dict)
     unlisted: frozenset[str] = frozenset()
     named: bool = True
+    first: int = 2
 
 
 def read_text_table(path: Path) -> TextTable:
@@ -78,6 +80,7 @@ def read_text_table(path: Path) -> TextTable:
         layout.units,
         unlisted | replaced,
         bool(layout.names),
+        layout.first,
     )
 
 
