@@ -428,7 +428,7 @@ def _run(path: Path, name: str, value: Any, declared: Declared) -> RunMarks:
     where = f"runs.{name}"
     own = table(path, where, value)
     allowed = [c.name for c in declared.constants]
-    _known(path, where, own, ("constants", "initial", "held_out", "folder", *allowed))
+    _known(path, where, own, ("constants", "initial", "held_out", "folder", "file", *allowed))
     held_out = own.get("held_out")
     if held_out is not None:
         checked(path, f"{where}.held_out", held_out, bool, "true or false")

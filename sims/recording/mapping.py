@@ -45,6 +45,7 @@ class Sources:
         folders: of each run, as seen from the description; none where there is one run.
         stated: whether any of it is said: else the table is one that was written for simgap.
         rate: Hz, rows in place of stamps; 0 where the logs have stamps.
+        files: by run, the file of the signals that state none, as seen from the run's folder.
     """
 
     signals: Mapping[str, Source]
@@ -54,6 +55,7 @@ class Sources:
     folders: Mapping[str, str] = field(default_factory=dict)
     stated: bool = False
     rate: float = 0.0
+    files: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_sources(
@@ -83,9 +85,14 @@ def read_sources(
         file = text(path, f"{name}.file", own.get("file", ""))
         column = text(path, f"{name}.column", own.get("column", name))
         signals[name] = Source(file, column)
-    folders = {}
+    folders, own_files = {}, {}
     for name, marks in table(path, "runs", meta.get("runs", {})).items():
-        if isinstance(marks, dict) and "folder" in marks:
+        if not isinstance(marks, dict):
+            continue
+        if "file" in marks:
+            own_files[name] = text(path, f"runs.{name}.file", marks["file"])
+            folders[name] = ""
+        if "folder" in marks:
             folders[name] = text(path, f"runs.{name}.folder", marks["folder"])
     said = any({"file", "column"} & own.keys() for own in columns.values())
     return Sources(
@@ -96,6 +103,7 @@ def read_sources(
         folders,
         bool(said or folders or {"column", "unit", "rate"} & time.keys()),
         rate,
+        own_files,
     )
 
 
@@ -124,7 +132,7 @@ def mapped(description: Path) -> list[Path]:
         meta = read_toml(description)
     except InputError:
         return []
-    signals = [_named(meta.get(kind), "file") for kind in ("channels", "inputs")]
+    signals = [_named(meta.get(kind), "file") for kind in ("channels", "inputs", "runs")]
     folders = _named(meta.get("runs"), "folder") or [""]
     # A signal without a file is in the table of the description's name in each folder.
     usual = description.with_suffix(".csv").name
@@ -170,7 +178,8 @@ def read_logs(
         here = path.parent / folder
         if len(name) > NAME:
             raise InputError(f"{path}: the name of run {name[:40]}… is too long")
-        parts = _Parts(here, path.name, sources, (*channels, *inputs))
+        usual = sources.files.get(name, path.name)
+        parts = _Parts(here, usual, sources, (*channels, *inputs))
         for own, rows in parts.runs(name):
             runs.append(parts.joined(own, rows, channels, inputs, linear))
     return runs

@@ -161,12 +161,17 @@ def _uneven(path: Path, layout: Layout) -> InputError | None:
     """What to say of the first row with another number of cells; None where all are even."""
     line = layout.first
     try:
-        for line, row in _rows(path, layout):
+        for line, last, row in _rows(path, layout):
             filled = len(row)
             while filled > layout.width and not row[filled - 1].strip():
                 filled -= 1
             if filled == layout.width:
                 continue
+            if last > line:
+                return InputError(
+                    f"{path}, row {line}: a quotation mark opens a cell that ends in row {last}; "
+                    "close or delete it"
+                )
             where = f"as in the header, row {layout.header}" if layout.header else "as above"
             remedy = "correct or delete this row"
             if filled < layout.width and line >= _last_line(path, layout):
@@ -183,33 +188,36 @@ def _uneven(path: Path, layout: Layout) -> InputError | None:
     return None
 
 
-def _rows(path: Path, layout: Layout) -> Iterator[tuple[int, list[str]]]:
-    """The rows of data with the lines on which they end, comments and blank lines left out."""
+def _rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
+    """The rows of data with their first and last lines, comments and blank lines left out."""
     with path.open(encoding=layout.encoding, errors="replace", newline="") as file:
         if layout.separator == " ":
             for line, text in enumerate(file, start=1):
                 if line >= layout.first and text.strip() and not COMMENT.match(text):
-                    yield line, text.split()
+                    yield line, line, text.split()
             return
         for _ in range(layout.first - 1):
             next(file, "")
-        reader = csv.reader(file, delimiter=layout.separator, skipinitialspace=True, strict=False)
+        reader = csv.reader(file, delimiter=layout.separator, skipinitialspace=True)
+        before = layout.first - 1
         for row in reader:
+            last = layout.first - 1 + reader.line_num
             if any(row) and not COMMENT.match(row[0]):
-                yield layout.first - 1 + reader.line_num, row
+                yield before + 1, last, row
+            before = last
 
 
 def _last_line(path: Path, layout: Layout) -> int:
     """The line of the last row of data."""
     last = 0
-    for line, _ in _rows(path, layout):
+    for line, *_ in _rows(path, layout):
         last = line
     return last
 
 
 def _line_of(path: Path, layout: Layout, record: int) -> int:
     """The line of a row of data, counted from 1 as an editor shows it."""
-    for number, (line, _) in enumerate(_rows(path, layout)):
+    for number, (line, *_) in enumerate(_rows(path, layout)):
         if number == record:
             return line
     return layout.first + record

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 Quantity = Literal["time", "angle", "length", "angular velocity", "velocity", "acceleration",
-                   "torque", "force", "current", "other"]  # fmt: skip
+                   "torque", "force", "current", "counts", "other"]  # fmt: skip
 """What a unit measures."""
 
 _SPELLINGS: Mapping[tuple[str, Quantity], str] = {
@@ -48,7 +48,7 @@ _SPELLINGS: Mapping[tuple[str, Quantity], str] = {
     ("degC", "other"): "°c degc celsius",
     ("%", "other"): "% percent",
     ("1", "other"): "1 -",
-    ("counts", "other"): "count counts tick ticks lsb raw digit digits inc incs increments steps "
+    ("counts", "counts"): "count counts tick ticks lsb raw digit digits inc incs increments steps "
     "pulses encoder_counts",
 }  # fmt: skip
 _UNITS: Mapping[str, tuple[str, Quantity]] = {
