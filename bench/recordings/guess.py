@@ -44,6 +44,8 @@ WORDS: Mapping[Role, frozenset[str]] = {
 """Words of a column's name, or of its file's, by what they say it is."""
 _VAGUE = frozenset({"joint", "joints", "state", "states", "current", "currents", "load", "loads"})
 """Words that say what a column is only where no other word does."""
+_MEASURED = frozenset(["meas", "measured", "actual", "act", "present", "sensed", "ist", "istwert"])
+"""Words of what a sensor measured, where a log has several signals of a kind."""
 _GLUED = re.compile(r"(?P<what>q|dq|qd|tau|pos|vel)(?P<command>des|cmd|ref|goal|target|desired)")
 """Words of two, as ``qdes`` and ``taucmd``."""
 _ROLE_OF_QUANTITY: Mapping[str, Role] = {
@@ -139,6 +141,11 @@ def commanded_role(column: Column) -> Role | None:
     own, file = _words(column)
     # `joint_command` says no more than `command`; `joint_position_command` does.
     return _measured(own - _VAGUE) or _measured(file - _VAGUE)
+
+
+def is_measured(column: Column) -> bool:
+    """Return whether a column's name says that it was measured."""
+    return bool(set(words_of(column.bare)) & _MEASURED)
 
 
 def _words(column: Column) -> tuple[set[str], set[str]]:

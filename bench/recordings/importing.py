@@ -732,6 +732,7 @@ class _Describing:
     def _efforts(self, columns: Sequence[Column]) -> None:
         """Measured torques as inputs where nothing commands a motor, or a joint without drive."""
         mine = [c for c in columns if guess.role_of(c) == "force" and _is_torque(c)]
+        torques: dict[str, list[tuple[Column, Joint, str]]] = {}
         for column, joint, why in self._by_joint(mine):
             own = self.drives.get(joint.name)
             if own is not None and own.kind == "motor":
@@ -741,7 +742,14 @@ class _Describing:
             else:
                 continue
             if name not in self.inputs:
-                self._force(column, joint, name, f"{why}, measured, as nothing commands it")
+                torques.setdefault(name, []).append((column, joint, why))
+        for name, found in torques.items():
+            measured = [one for one in found if guess.is_measured(one[0])]
+            # What a controller asked for and what friction took may be torques of a log, too.
+            if len(found) > 1 and len(measured) != 1:
+                continue
+            ((column, joint, why),) = measured if len(found) > 1 else found
+            self._force(column, joint, name, f"{why}, measured, as nothing commands it")
 
     # -- what is said
 

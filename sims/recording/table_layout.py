@@ -28,7 +28,9 @@ _HEAD_LINES = 400
 """Maximum number of lines from which the layout is found."""
 COMMENT = re.compile(r"\s*(#+|%+|//+|!+)\s*")
 """The beginning of a line that is a comment."""
-NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)*|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE)
+NUMBER = re.compile(
+    r"[+-]?(\d+([.,]\d+)*\.?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE
+)
 """A number with a decimal point or comma."""
 NUMBERS = re.compile(r"[\[\(](?P<inside>[^\]\)]*)[\]\)]")
 """A list of numbers in one cell."""

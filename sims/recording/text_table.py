@@ -223,6 +223,10 @@ def _line_of(path: Path, layout: Layout, record: int) -> int:
     return layout.first + record
 
 
+MAX_SAMPLED_CELLS = 1000
+"""Maximum number of cells of a column by which text is told from numbers with commas."""
+
+
 class _CellKind:
     """The cells of one column, and what kind of numbers they hold."""
 
@@ -233,17 +237,21 @@ class _CellKind:
         self.series = pandas.Series(cells, dtype=object).astype(str).str.strip()
         self.texts = self.series.to_numpy(dtype=object)
         self.filled = self.series[self.series != ""]
+        self.has_commas, self.has_decimal_commas, self.is_thousands = False, False, False
         commas = self.filled[self.filled.str.contains(",", regex=False)]
-        self.has_commas = bool(len(commas)) and bool(commas.map(NUMBER.fullmatch).notna().all())
-        # Three digits behind a comma may be thousands, unless cells are divided by something else.
-        thousands = commas.str.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?")
-        self.has_decimal_commas = self.has_commas and (
-            (separator != "," and not commas.str.contains(r",.*\.|,.*,", regex=True).any())
-            or (separator == "," and not bool(thousands.all()))
-        )
-        self.is_thousands = self.has_commas and bool(
-            commas.str.fullmatch(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?").all()
-        )
+        some = commas.iloc[:: max(len(commas) // MAX_SAMPLED_CELLS, 1)]
+        # A list has commas, too, and a text may have.
+        if commas.empty or 2 * sum(map(bool, map(NUMBER.fullmatch, some))) < len(some):
+            return
+        self.has_commas = True
+        several = (commas.str.count(",") > 1) | commas.str.contains(r",.*\.", regex=True)
+        self.is_thousands = bool(several.any())
+        if separator != ",":
+            self.has_decimal_commas = not self.is_thousands
+        else:
+            # Three digits behind a comma may be thousands, unless other cells say what they are.
+            groups = commas.str.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?")
+            self.has_decimal_commas = not bool(groups.all()) and not self.is_thousands
 
     def numbers(self, path: Path, layout: Layout, name: str, commas: bool) -> Array | None:
         """(T,) or (T, k) numbers; None where the column holds text."""
@@ -258,9 +266,9 @@ class _CellKind:
             return self._instants(path, layout, name)
         texts = self.series
         if self.has_commas:
-            if self.has_decimal_commas or commas:
+            if self.has_decimal_commas or (commas and not self.is_thousands):
                 texts = self._decimal_points(path, layout, name)
-            elif self.is_thousands and self.filled.str.contains(r",.*\.|,.*,", regex=True).any():
+            elif self.is_thousands:
                 texts = texts.str.replace(",", "", regex=False)
             else:
                 row = int(np.flatnonzero(texts.str.contains(",", regex=False))[0])

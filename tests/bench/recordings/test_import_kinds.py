@@ -267,6 +267,21 @@ def test_torques_drive_what_nothing_commands(drive, name, word, tmp_path):
     )
 
 
+def test_of_several_torques_the_measured_one_drives_else_none(tmp_path):
+    arm = model(tmp_path, "")
+    columns = {"t": TIMES} | {f"{j}_pos": POSITIONS[:, k] for k, j in enumerate(JOINTS)}
+    for k, word in enumerate(("tau_con", "tau_fric", "tau_meas")):
+        columns |= {f"{j}_{word}": (k + 1) * COMMANDS[:, i] for i, j in enumerate(JOINTS)}
+    simgap.import_logs([table(tmp_path / "log.csv", columns)], arm, tmp_path / "log.toml")
+    seen = inputs(tmp_path / "log.toml")["force.bend"]
+    np.testing.assert_allclose(seen, 3 * COMMANDS[:, 2], atol=1e-6)
+    columns = {name.replace("meas", "other"): values for name, values in columns.items()}
+    made = simgap.import_logs([table(tmp_path / "o.csv", columns)], arm, tmp_path / "o.toml")
+    assert inputs(tmp_path / "o.toml") == {}
+    (check,) = made.checks
+    assert "nothing drives it; columns that may be it: yaw_tau_con, lift_tau_con" in check
+
+
 def test_a_model_without_an_input_is_said(tmp_path):
     arm = model(tmp_path, "")
     columns = {"t": TIMES} | {f"{j}_pos": POSITIONS[:, k] for k, j in enumerate(JOINTS)}

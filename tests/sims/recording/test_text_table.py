@@ -79,6 +79,13 @@ def test_thousands_are_told_from_decimals(tmp_path):
     assert log.column("t").tolist() == [1000.5, 1001.5]
 
 
+def test_blanks_within_lists_do_not_divide_cells(tmp_path):
+    rows = "".join(f'CONTROL,{t},"[{a}, {b}, {a}, {b}]"\n' for t, a, b in ROWS)
+    log = read(tmp_path, "type,timestamp,positions\n" + rows)
+    assert log.names() == ["timestamp", *(f"positions[{k}]" for k in range(4))]
+    assert log.texts == ("type",)
+
+
 def test_instants_are_seconds(tmp_path):
     log = read(tmp_path, "when,q\n2026-11-26 10:00:00.000,1\n2026-11-26 10:00:00.250,2\n")
     assert np.diff(log.column("when")).tolist() == [0.25]
