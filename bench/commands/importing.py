@@ -15,8 +15,8 @@ def add_import(parser: argparse.ArgumentParser) -> None:
         metavar="LOG",
         nargs="+",
         type=place,
-        help="files of one run (.csv, .tsv, .npz, .parquet), or folders or bags (ROS 1, ROS 2, "
-        "MCAP) that each hold one, or datasets of LeRobot",
+        help="files of one run (.csv, .tsv, .npz, .parquet, .pt, .hdf5), or folders or bags (ROS "
+        "1, ROS 2, MCAP) that each hold one, or datasets of LeRobot",
     )
     parser.add_argument(
         "--model", metavar="FILE", type=place, required=True, help="what they are of: MJCF or URDF"

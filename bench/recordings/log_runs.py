@@ -8,10 +8,11 @@ from typing import NamedTuple
 
 from sims.base import InputError
 from sims.recording.bags import ENDINGS, is_bag
+from sims.recording.hdf5 import is_hdf5, runs_in
 from sims.recording.lerobot import is_dataset
 from sims.recording.logs import logs_in, read_log
 
-TABLES = (".csv", ".tsv", ".npz", ".parquet")
+TABLES = (".csv", ".tsv", ".npz", ".parquet", ".pt", ".pth", ".h5", ".hdf5", ".hdf")
 """Endings of what is taken from a folder; other texts may be anything."""
 
 
@@ -72,8 +73,18 @@ def runs_of(logs: Sequence[Path]) -> dict[str, RunFiles]:
         raise InputError(f"{given}: expected logs ({kinds}), found none")
     if len(runs) == 1:
         ((name, run),) = runs.items()
-        return _one_run_a_file(run) or {name: run}
+        return _one_run_a_group(run) or _one_run_a_file(run) or {name: run}
     return runs
+
+
+def _one_run_a_group(run: RunFiles) -> dict[str, RunFiles]:
+    """Return a run for each group of one HDF5 file that has one for each; nothing otherwise."""
+    if len(run.paths) != 1 or not is_hdf5(run.paths[0]):
+        return {}
+    groups = runs_in(run.paths[0])
+    if groups == run.paths:
+        return {}
+    return {group.name: RunFiles(run.folder, [group], True, run.chosen) for group in groups}
 
 
 def _one_run_a_file(run: RunFiles) -> dict[str, RunFiles]:

@@ -1,5 +1,5 @@
-"""Logs as their loggers wrote them: a CSV of any layout, a NumPy archive, a Parquet file, a topic
-of a bag, an episode of a dataset.
+"""Logs as their loggers wrote them: a table of text of any layout, a NumPy archive, a Parquet, HDF5
+or PyTorch file, a topic of a bag, an episode of a dataset.
 
 A column is named as the log names it, ``positions[2]`` being the third entry of what holds a list
 or a vector in each row. Nothing is unpickled.
@@ -18,12 +18,25 @@ import numpy as np
 
 from sims.base import Array, InputError, frozen
 from sims.files import require_file
-from sims.recording import bags, lerobot
+from sims.recording import bags, hdf5, lerobot
 from sims.recording.columnar import columns_of, unreadable
 from sims.recording.named_entries import arrays_by_name
 from sims.recording.text_table import read_text_table
+from sims.recording.torch_tensors import read_tensors
 
-FORMATS = (".csv", ".tsv", ".txt", ".dat", ".npz", ".parquet")
+FORMATS = (
+    ".csv",
+    ".tsv",
+    ".txt",
+    ".dat",
+    ".npz",
+    ".parquet",
+    ".pt",
+    ".pth",
+    ".h5",
+    ".hdf5",
+    ".hdf",
+)
 """What can be read, by the name's ending."""
 LARGEST = 2_000_000_000
 """Bytes of a file: more would not fit beside what is made of it."""
@@ -142,6 +155,10 @@ def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> Log:
         abouts = [file.stat() for file in lerobot.files_of(*episode)]
         changed = max(about.st_mtime_ns for about in abouts)
         return _read_episode(Stamp(path, changed, sum(about.st_size for about in abouts)))
+    group = hdf5.group_of(path)
+    if group is not None:
+        about = group[0].stat()
+        return _read_group(Stamp(path, about.st_mtime_ns, about.st_size))
     if bags.is_bag(path):
         there = ", ".join(bags.topics(path))
         raise InputError(f"{path}: a bag; name a topic of it, as {path.name}/TOPIC: {there}")
@@ -174,6 +191,14 @@ def _read_episode(stamp: Stamp) -> Log:
     assert episode is not None  # it is one that was asked for
     columns, texts = lerobot.read_episode(*episode)
     return Log(stamp.path, columns, tuple(texts), "frame")
+
+
+@lru_cache(maxsize=8)
+def _read_group(stamp: Stamp) -> Log:
+    """A group of an HDF5 file, read once."""
+    group = hdf5.group_of(stamp.path)
+    assert group is not None  # it is one that was asked for
+    return _of_arrays(stamp.path, *hdf5.read_group(*group))
 
 
 @lru_cache(maxsize=8)
@@ -236,6 +261,19 @@ def _archive(path: Path) -> Log:
     return Log(path, {**columns, **named}, tuple(texts), "entry", unlisted=unlisted)
 
 
+def _of_arrays(path: Path, columns: dict[str, Array], texts: dict[str, list[str]]) -> Log:
+    """Arrays of a file, named by its lists of names where it has some."""
+    if not columns:
+        raise InputError(f"{path}: expected columns of numbers, found none")
+    named, unlisted = arrays_by_name(columns, {name: own for name, own in texts.items() if own})
+    return Log(path, {**columns, **named}, tuple(texts), "entry", unlisted=unlisted, first=0)
+
+
+def _tensors(path: Path) -> Log:
+    """The tensors of a PyTorch file, one row an instant."""
+    return _of_arrays(path, *read_tensors(path))
+
+
 def _parquet(path: Path) -> Log:
     """The columns of a Parquet file, lists too."""
     import pyarrow
@@ -256,6 +294,8 @@ _READERS: Mapping[str, Callable[[Path], Log]] = {
     ".dat": _table,
     ".npz": _archive,
     ".parquet": _parquet,
+    ".pt": _tensors,
+    ".pth": _tensors,
 }
 
 
