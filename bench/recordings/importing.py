@@ -24,6 +24,7 @@ from bench.recordings.normalised import (
     is_lerobot,
     normalised_positions,
 )
+from bench.recordings.order_by_model import preferred_order
 from bench.recordings.servos import Following, following
 from sims.base import Array, InputError
 from sims.recording.logs import Log, read_log
@@ -40,6 +41,8 @@ _GAINS = "actuator.stiffness", "actuator.damping"
 """What nobody has stated of a servo that a model file lacks."""
 _BY_COMMANDS = "in the order in which positions follow their commands"
 """Why a column that is numbered is of its joint although the model's order says another one."""
+_BY_MODEL = "in the order in which the model explains the motion best"
+"""Why columns without names are of their joints although the model's order is another one."""
 POSITION_UNITS = ("rad", "deg", "normalised")
 """Units of positions that a user may state; normalised ones are those of LeRobot."""
 _BY_ORDER = "by the model's order of joints"
@@ -579,7 +582,12 @@ class _Describing:
                 u = [c.si(unit, v) for c, unit, (v, _) in zip(commands, units, held, strict=True)]
                 q = [c.si(unit, v) for c, unit, (_, v) in zip(positions, units, held, strict=True)]
                 moved = self._reorder(joints, servos, guessed, u, q)
-                self._say_order(joints, follow(u, q) or bool(moved))
+                follows = follow(u, q) or bool(moved)
+                if all(guessed[0]) and all(guessed[1]) and follows and not moved:
+                    preferred = self._prefer(joints, servos, u, q)
+                    if preferred:
+                        return preferred
+                self._say_order(joints, follows)
                 return moved if all(guessed[1]) and not all(guessed[0]) else {}
         self._say_order(joints, False)
         return {}
@@ -617,6 +625,49 @@ class _Describing:
                 told = signal.why.replace(_BY_ORDER, why)
                 self.channels[f"q.{joint}"] = replace(signal, why=told)
         return {joint: joints[place] for place, joint in zip(order, joints, strict=True)}
+
+    def _prefer(
+        self,
+        joints: Sequence[str],
+        servos: Mapping[str, str],
+        commands: Sequence[Array],
+        positions: Sequence[Array],
+    ) -> dict[str, str]:
+        """Exchange columns without names if the model explains the motion far better then.
+
+        Returns:
+            By joint, the joint of whose place its column is; nothing where the order stays.
+        """
+        drives = [self.drives.get(joint) for joint in joints]
+        driven = [
+            (self.robot.joint(joint), drive)
+            for joint, drive in zip(joints, drives, strict=True)
+            if drive is not None
+        ]
+        # Gains that nobody knows explain nothing, and normalised numbers belong to their joints.
+        if len(driven) < len(joints) or self.normalised is not None:
+            return {}
+        if all(map(self._has_its_number, joints)):
+            return {}
+        seconds = self.seconds[self.channels[f"q.{joints[0]}"].column.file]
+        told = preferred_order(self.robot, driven, seconds, commands, positions)
+        if told is None or not told.is_certain():
+            return {}
+        own = {joint: (self.channels[f"q.{joint}"], self.inputs[servos[joint]]) for joint in joints}
+        moved = {joint: joints[place] for joint, place in zip(joints, told.order, strict=True)}
+        for joint, other in moved.items():
+            for table, name, signal in zip(
+                (self.channels, self.inputs), (f"q.{joint}", servos[joint]), own[other], strict=True
+            ):
+                table[name] = replace(signal, why=signal.why.replace(_BY_ORDER, _BY_MODEL))
+        columns = sorted(joints, key=lambda joint: told.order[joints.index(joint)])
+        self.made_of.checks.append(
+            "order of joints: the log does not name those of its columns; they are taken in the "
+            f"order {', '.join(columns)}, in which the model explains the motion best (a residual "
+            f"of {told.residual:.2g} of the drives' forces, {told.usual:.2g} in the model's order, "
+            f"{', '.join(joints)}); it is a guess: compare it with the logger's order"
+        )
+        return moved
 
     def _say_order(self, joints: Sequence[str], follows: bool) -> None:
         """Say whether positions follow their commands, and that an order is a guess where nothing
@@ -690,10 +741,11 @@ class _Describing:
         mine = [c for c in columns if guess.role_of(c) == "velocity"]
         placed = self._by_joint(mine)
         by_place = {joint.name: column for column, joint, why in placed if why == _BY_ORDER}
-        for own, joint, why in placed:
-            column = own
+        for own, joint, told in placed:
+            column, why = own, told
             if why == _BY_ORDER and joint.name in moved:
                 column = by_place.get(moved[joint.name], own)
+                why = "in the order of the positions"
             position = self.channels.get(f"q.{joint.name}")
             if guess.still(column.values):
                 self._untold(column, "never changes")

@@ -14,7 +14,8 @@ from bench.cli import main
 from bench.recordings.inspection import load
 from bench.recordings.joint_order import order_of_commands
 from bench.recordings.stamps import refuse_odd
-from sims.base import InputError
+from bench.registry import robot
+from sims.base import InputError, Scenario
 
 CASES = Path(os.environ.get("SIMGAP_DATA", "")).parent / "cases"
 JOINTS = ("yaw", "lift", "bend")
@@ -125,6 +126,34 @@ def test_an_order_that_nothing_tells_is_said_to_be_a_guess(arm, tmp_path, capsys
     assert line.startswith("check: order of joints: the log does not name those of its columns")
     assert "yaw, lift, bend, which is a guess (sorted by name, as ROS drivers have it" in line
     assert "# check: order of joints" in (tmp_path / "log.toml").read_text()
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1), (1, 2, 0)])
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_an_order_without_names_is_the_one_that_the_model_prefers(order, friction, arm, tmp_path):
+    real = tmp_path / "real.xml"
+    real.write_text(arm.read_text().replace('axis="0 1 0"', f'axis="0 1 0" damping="{friction}"'))
+    names = [f"q.{joint}" for joint in JOINTS]
+    given = {f"u.m_{joint}": COMMANDS[:, k] for k, joint in enumerate(JOINTS)}
+    kind = robot(real)
+    seen = kind(observe=names).simulate(np.empty((1, 0)), Scenario(TIMES, {}, given))[0]
+    places = [[c.name for c in kind(observe=names).channels].index(name) for name in names]
+    positions = seen[:, places] + 1e-4 * np.random.default_rng(0).standard_normal(seen.shape)
+    rates = np.gradient(positions, TIMES, axis=0)
+    own = list(order)
+    np.savez(tmp_path / "log.npz", t=TIMES, actual_q=positions[:, own], actual_qd=rates[:, own],
+             target_q=COMMANDS[:, own])  # fmt: skip
+    made = simgap.import_logs([tmp_path / "log.npz"], arm, tmp_path / "log.toml")
+    for k, joint in enumerate(JOINTS):
+        np.testing.assert_allclose(channel(tmp_path / "log.toml", f"q.{joint}"), positions[:, k])
+        np.testing.assert_allclose(channel(tmp_path / "log.toml", f"qd.{joint}"), rates[:, k])
+        np.testing.assert_allclose(inputs(tmp_path / "log.toml")[f"u.m_{joint}"], COMMANDS[:, k])
+    (check,) = made.checks
+    assert "which is a guess" in check or "it is a guess: compare it" in check
+    if order != (0, 1, 2):
+        assert (
+            f"taken in the order {', '.join(JOINTS[k] for k in order)}, in which the model" in check
+        )
 
 
 @pytest.mark.parametrize("order", [(0, 2, 1), (2, 0, 1)])
@@ -534,7 +563,8 @@ def test_a_faulty_calibration_is_one_line(text, message, arm, tmp_path):
          ["q.elbow: joint_states.csv, column field.position.elbow, by its name"]),
         ("spreadsheet_export", ["run1.csv", "run2.csv", "run3.csv"],
          ["q.elbow: run1.csv, column elbow [deg], by its name; in deg by its name"]),
-        ("npz_alphabetical", ["run1.npz"], ["check: order of joints: "]),
+        ("npz_alphabetical", ["run1.npz"],
+         ["check: order of joints: ", "order base_yaw, elbow, shoulder, in which the model"]),
         ("lerobot_normalised", ["dataset"], ["check: positions lie within -100 to 100"]),
     ],
 )  # fmt: skip
