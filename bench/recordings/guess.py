@@ -121,7 +121,7 @@ def words_of(text: str) -> list[str]:
 
 
 def role_of(column: Column) -> Role | None:
-    """What a column is by its name and unit, else by its file's name; None if none says it."""
+    """Return what a column is by its name and unit, else by its file's; None if none says it."""
     own, file = _words(column)
     if own & WORDS["command"] or (file & WORDS["command"] and not own & WORDS["other"]):
         return "command"
@@ -131,7 +131,7 @@ def role_of(column: Column) -> Role | None:
 
 
 def commanded_role(column: Column) -> Role | None:
-    """What a command asks for by its name and unit, else by its file's name: a position, a
+    """Return what a command asks for by its name and unit, else by its file's name: a position, a
     velocity or a force; None if none says it.
     """
     if column.quantity in _ROLE_OF_QUANTITY:
@@ -211,8 +211,8 @@ def numbered(columns: Sequence[Column], joints: Sequence[Joint]) -> dict[str, Jo
 
 
 def clocks(columns: Iterable[Column]) -> list[Column]:
-    """Columns that may be stamps, the likeliest first: the stamp of a message's header, others that
-    are called so or have a unit of time, and columns of other names that increase.
+    """Return the columns that may be stamps, the likeliest first: the stamp of a message's header,
+    others that are called so or have a unit of time, and columns of other names that increase.
     """
     ranked = []
     for place, column in enumerate(columns):
@@ -253,7 +253,7 @@ def _within(ends: Array, limits: tuple[float, float]) -> bool:
 
 
 def unit_of_rate(rate: Array, slope: Array, joint: Joint, stated: str = "") -> str | None:
-    """The unit of a rate by (1); None where it is not the derivative of the position.
+    """Return the unit of a rate by (1); None where it is not the derivative of the position.
 
     Args:
         rate: (T,) numbers of the rate.
