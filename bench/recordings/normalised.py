@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,8 +22,10 @@ from sims.recording.lerobot_calibration import (
     read_calibration,
 )
 from sims.recording.recording import Recording
-from sims.robot.model import Joint
 from sims.user_toml import read_toml
+
+if TYPE_CHECKING:  # a recording of no robot needs no model
+    from sims.robot.model import Joint
 
 LARGEST = 100.0 + 1e-3
 """Largest magnitude of a normalised position, with the rounding of 32 bits."""

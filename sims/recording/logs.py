@@ -22,7 +22,6 @@ from sims.recording import bags, hdf5, lerobot
 from sims.recording.columnar import columns_of, unreadable
 from sims.recording.named_entries import arrays_by_name
 from sims.recording.text_table import read_text_table
-from sims.recording.torch_tensors import read_tensors
 
 FORMATS = (
     ".csv",
@@ -271,6 +270,9 @@ def _of_arrays(path: Path, columns: dict[str, Array], texts: dict[str, list[str]
 
 def _tensors(path: Path) -> Log:
     """The tensors of a PyTorch file, one row an instant."""
+    # Loaded here alone: few logs are archives of tensors.
+    from sims.recording.torch_tensors import read_tensors
+
     return _of_arrays(path, *read_tensors(path))
 
 
