@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeAlias
 
 from bench.api.explain import Source, Units, sources_of
 from bench.recordings.frames import FrameDescription
-from bench.recordings.importing import Imported, checked, describe
+from bench.recordings.importing import Imported, ImportOptions, checked, describe
 from bench.recordings.inspection import load
 from bench.recordings.simulate import Coefficients, SimulatedRecording, Wish, make
 from sims.arguments import Expected, Name, Names, check_arguments
@@ -144,6 +144,9 @@ def import_logs(
     out: str | Path,
     *,
     held_out: Names = (),
+    rate: float | None = None,
+    position_unit: Name = "",
+    calibration: str | Path | None = None,
 ) -> Imported:
     """Describe a robot's logs as they lie: write the toml by which every command reads them.
 
@@ -152,9 +155,13 @@ def import_logs(
         model: what they are of, MJCF or URDF.
         out: NAME.toml, a new file.
         held_out: runs that no fit is to see; every third one without.
+        rate: of the rows, Hz, where the logs have no stamps.
+        position_unit: of positions and their commands that state none: ``rad``, ``deg``, or
+            ``normalised`` (-100 to 100 of LeRobot); told from the joints' ranges without.
+        calibration: calibration file of LeRobot, by which normalised positions become angles.
 
     Returns:
-        What was guessed, and what could not be told.
+        What was guessed, what could not be told, and what to check.
 
     Raises:
         InputError: the logs cannot be read or nothing in them is the robot's, in one line; then
@@ -166,6 +173,8 @@ def import_logs(
         raise InputError(f"expected a description to write, NAME.toml, found '{path}'")
     refuse_existing([path])
     paths = [Path(log) for log in given]
-    made = describe(paths, read(Path(model)), Path(model), path.parent, held_out)
+    file = None if calibration is None else Path(calibration)
+    options = ImportOptions(held_out, rate, position_unit, file)
+    made = describe(paths, read(Path(model)), Path(model), path.parent, options)
     checked(path, made.text)
     return made

@@ -172,7 +172,7 @@ def _inspect(options: argparse.Namespace, say: Say) -> Answer:
     from bench.recordings.afloat import unplaced
     from bench.recordings.census.census import census
     from bench.recordings.inspection import load, summary
-    from bench.recordings.stamps import oddities
+    from bench.recordings.stamps import odd_logs, oddities
     from bench.registry import load_plugins
     from sims.base import InputError
 
@@ -181,7 +181,7 @@ def _inspect(options: argparse.Namespace, say: Say) -> Answer:
         raise InputError("--free says what --check asks about; give --check besides")
     recording, kind = load(options.recording, options.system, options.model)
     about = list(robotic.about(kind))
-    found = [*oddities(recording, kind), *unplaced(recording, kind)]
+    found = [*odd_logs(recording), *oddities(recording, kind), *unplaced(recording, kind)]
     odd = [*(o.text for o in found), *robotic.odd(recording, kind)]
     findings = list(census(recording, kind))
     differences, fixes = _differing_conventions(options, recording, kind)

@@ -10,6 +10,7 @@ from pathlib import Path
 from sims.base import InputError
 from sims.recording.bags import bag_of
 from sims.recording.description import description_of
+from sims.recording.hdf5 import group_of
 from sims.recording.lerobot import episode_of, files_of
 from sims.recording.mapping import mapped
 
@@ -51,7 +52,7 @@ def content_of(path: Path) -> bytes:
             return b"".join(content_of(file) for file in files_of(*episode))
         except InputError:
             return b""
-    bag = bag_of(path)
+    bag = bag_of(path) or group_of(path)
     whole = path if bag is None else bag[0]
     files = sorted(whole.rglob("*")) if bag is not None and whole.is_dir() else [whole]
     content = hashlib.sha256()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,23 +15,62 @@ from bench.recordings import guess
 from bench.recordings.census import rates
 from bench.recordings.guess import Column
 from bench.recordings.inspection import load
+from bench.recordings.joint_order import follow, order_of_commands
+from bench.recordings.log_runs import RunFiles, runs_of
+from bench.recordings.normalised import (
+    LARGEST,
+    REMEDY,
+    NormalisedPositions,
+    is_lerobot,
+    normalised_positions,
+)
+from bench.recordings.order_by_model import preferred_order
 from bench.recordings.servos import Following, following
 from sims.base import Array, InputError
-from sims.recording.bags import ENDINGS, TIME, is_bag
-from sims.recording.lerobot import is_dataset
-from sims.recording.logs import Log, logs_in, read_log
+from sims.recording.logs import Log, read_log
 from sims.recording.recording import Run
+from sims.recording.units import scale
 from sims.recording.write import publish
-from sims.robot.model import Joint, Robot
+from sims.robot.model import Actuator, Joint, Robot
 from sims.robot.scales import scales
 from sims.user_toml import known
 
 QUICK, DAMPED = 20.0, 0.7
 """rad/s and share of critical damping of a servo whose gains nobody has stated or shown."""
-TABLES = (".csv", ".tsv", ".npz", ".parquet")
-"""Endings of what is taken from a folder; other texts may be anything."""
 _GAINS = "actuator.stiffness", "actuator.damping"
 """What nobody has stated of a servo that a model file lacks."""
+_BY_COMMANDS = "in the order in which positions follow their commands"
+"""Why a column that is numbered is of its joint although the model's order says another one."""
+_BY_MODEL = "in the order in which the model explains the motion best"
+"""Why columns without names are of their joints although the model's order is another one."""
+POSITION_UNITS = ("rad", "deg", "normalised")
+"""Units of positions that a user may state; normalised ones are those of LeRobot."""
+_BY_ORDER = "by the model's order of joints"
+"""Why a column that is numbered is of its joint."""
+FOLLOWS = 0.9
+"""Minimum correlation of a motor's command with a position that makes it a desired position."""
+MOST_RUNS = 8
+"""Maximum number of runs in which the largest position is looked for."""
+MOST_NAMES = 12
+"""Maximum number of names in a line."""
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """What a user states of logs.
+
+    Attributes:
+        held_out: runs that no fit is to see.
+        rate: of the rows, Hz, where the logs have no stamps.
+        position_unit: of positions and their commands, one of `POSITION_UNITS`; empty where it is
+            to be told from the joints' ranges.
+        calibration: calibration file of LeRobot; None to look for it beside the dataset.
+    """
+
+    held_out: Collection[str] = ()
+    rate: float | None = None
+    position_unit: str = ""
+    calibration: Path | None = None
 
 
 @dataclass
@@ -42,90 +81,66 @@ class Imported:
         text: the description.
         guessed: what was guessed, a line each.
         untold: what could not be told, a line each.
+        checks: what the user has to check before the description is used, a line each.
     """
 
     text: str
     guessed: list[str] = field(default_factory=list)
     untold: list[str] = field(default_factory=list)
+    checks: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """The column of a channel or an input.
+
+    Attributes:
+        column: of the log.
+        unit: of its numbers, after scale and offset.
+        why: by what it was told.
+        scale: by which its numbers are multiplied.
+        offset: added after that.
+    """
+
+    column: Column
+    unit: str
+    why: str
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def si(self, unit: str, values: Array) -> Array:
+        """Convert numbers of the column to an SI unit."""
+        own = scale(self.unit, unit)
+        converted: Array = own.gain * (self.scale * values + self.offset) + own.offset
+        return converted
 
 
 def describe(
-    logs: Sequence[Path], robot: Robot, model: Path, beside: Path, held_out: Collection[str] = ()
+    logs: Sequence[Path],
+    robot: Robot,
+    model: Path,
+    beside: Path,
+    options: ImportOptions | None = None,
 ) -> Imported:
-    """The description of logs of a robot.
+    """Describe logs of a robot.
 
     Args:
         logs: files of one run, folders that each hold those of one, or datasets of LeRobot.
         robot: what they are of.
         model: its model file.
         beside: the folder where the description will stand.
-        held_out: runs that no fit is to see.
+        options: what the user states of them.
 
     Raises:
         InputError: they cannot be read, there is nothing in them that a robot has, or no such run.
     """
+    options = options or ImportOptions()
+    known("position unit", [options.position_unit] * bool(options.position_unit), POSITION_UNITS)
+    if options.rate is not None and not 0 < options.rate < np.inf:
+        raise InputError(f"rate {options.rate:g}: expected a number of rows a second, more than 0")
     runs = runs_of(logs)
-    known("run held out", held_out, [name for name in runs if name])
-    files = next(iter(runs.values()))
-    read = {files.name(path): read_log(path) for path in files.paths}
-    return _Describing(robot, model, beside, runs, read, held_out).made()
-
-
-class Files(NamedTuple):
-    """The logs of one run, and the folder, or the bag, that they are in."""
-
-    folder: Path
-    paths: list[Path]
-
-    def name(self, path: Path) -> str:
-        """What a description calls a log."""
-        return path.relative_to(self.folder).as_posix()
-
-
-def runs_of(logs: Sequence[Path]) -> dict[str, Files]:
-    """Logs by run: those of each folder, bag or episode, or the files themselves as one run.
-
-    Raises:
-        InputError: there is no log.
-    """
-    files = [path for path in logs if not path.is_dir() and not is_bag(path)]
-    runs: dict[str, Files] = {}
-    for folder in (path for path in logs if path not in files):
-        if is_dataset(folder):
-            runs |= {path.parent.name: Files(path.parent, [path]) for path in logs_in(folder)}
-            continue
-        inside = [folder] if is_bag(folder) else [folder, *sorted(folder.iterdir())]
-        for one in inside:
-            if is_bag(one):
-                own = [path for path in logs_in(one) if _is_log(path)]
-            elif one.is_dir():
-                own = [path for path in logs_in(one) if path.suffix.lower() in TABLES]
-            else:
-                continue
-            if own:
-                runs[one.stem if one.is_file() else one.name] = Files(one, own)
-    if files and runs:
-        raise InputError("expected files of one run, or folders of one run each, found both")
-    if files:
-        folders = {path.parent for path in files}
-        if len(folders) > 1:
-            raise InputError("expected the files of one run in one folder; name the folders")
-        runs = {"": Files(folders.pop(), files)}
-    if not runs:
-        found = ", ".join(map(str, logs))
-        kinds = ", ".join((*TABLES, *ENDINGS))
-        raise InputError(f"{found}: expected logs ({kinds}), found none")
-    return runs
-
-
-def _is_log(topic: Path) -> bool:
-    """Whether a topic holds numbers whose stamps increase."""
-    try:
-        log = read_log(topic)
-    except InputError:
-        return False
-    times = log.column(TIME)
-    return bool(times.size > 2 and (np.diff(times) > 0).all())
+    known("run held out", options.held_out, [name for name in runs if name])
+    return _Describing(robot, model, beside, runs, options).made()
 
 
 def checked(path: Path, text: str) -> None:
@@ -152,77 +167,213 @@ class _Describing:
         robot: Robot,
         model: Path,
         beside: Path,
-        runs: Mapping[str, Files],
-        logs: Mapping[str, Log],
-        held_out: Collection[str],
+        runs: Mapping[str, RunFiles],
+        options: ImportOptions,
     ) -> None:
-        self.held_out = held_out
-        self.robot, self.model, self.beside, self.runs, self.logs = robot, model, beside, runs, logs
+        self.robot, self.model, self.beside = robot, model, beside
+        self.runs, self.options = runs, options
         self.joints = [joint for joint in robot.joints if joint.single]
+        self.drives = {a.joint: a for a in robot.actuators if a.joint}
         self.made_of = Imported("")
-        self.channels: dict[str, tuple[Column, str, str]] = {}
-        self.inputs: dict[str, tuple[Column, str, str]] = {}
+        self.channels: dict[str, Signal] = {}
+        self.inputs: dict[str, Signal] = {}
         self.added: dict[str, Joint] = {}
         self.seconds: dict[str, Array] = {}
-        self.time, self.unit = "", ""
-        self._read = {log.path: log for log in logs.values()}
+        self._starts: dict[str, float] = {}
+        self.time, self.unit = "", "s"
+        self.normalised: NormalisedPositions | None = None
+        self._read: dict[Path, Log] = {}
 
     def made(self) -> Imported:
         """The description."""
-        time, unit = self.time, self.unit = self._time()
-        every = [
-            Column(file, name, np.where(np.isfinite(values), values, np.nan))
-            for file, log in self.logs.items()
-            for name in log.names()
-            for values in (log.column(name),)
-            if name != time
-        ]
-        columns = [column for column in every if np.isfinite(column.values).any()]
-        for column in every:
-            if np.isnan(column.values).all():
-                self._untold(column, "has no number")
+        logs = self._logs()
+        columns = self._timed(logs)
+        self._say_normalised(columns)
         self._positions(columns)
-        self._rates(columns)
-        self._commands(columns)
         if not self.channels:
-            there = ", ".join(f"{c.file}: {c.name}" for c in columns[:12])
+            there = ", ".join(f"{c.file}: {c.name}" for c in columns[:MOST_NAMES])
             raise InputError(
-                f"{next(iter(self.logs.values())).path}: no column is a joint's position by name, "
+                f"{next(iter(logs.values())).path}: no column is a joint's position by name, "
                 f"number or range; there are {there}; write the description by hand"
             )
+        self._commands(columns)
+        moved = self._order()
+        self._rates(columns, moved)
+        self._efforts(columns)
+        self._say_inputs(columns)
         self._say_rest(columns)
-        self.made_of.text = self._text(time, unit)
+        self.made_of.text = self._text()
         return self.made_of
 
-    def _time(self) -> tuple[str, str]:
-        """The column of stamps and its unit, the same in all files."""
-        found: dict[str, str] = {}
-        for file, log in self.logs.items():
-            columns = [Column(file, name, log.column(name)) for name in log.names()]
-            time = guess.time_of(columns)
-            if time is None:
-                raise InputError(
-                    f"{log.path}: no column increases from row to row; expected one of stamps"
+    # -- files and stamps
+
+    def _logs(self) -> dict[str, Log]:
+        """The logs of the first run by name; those of a folder that cannot be read are left out.
+
+        Raises:
+            InputError: a file that the user named cannot be read, or none can.
+        """
+        files = next(iter(self.runs.values()))
+        logs: dict[str, Log] = {}
+        faults: list[InputError] = []
+        for path in files.paths:
+            try:
+                log = self._log(path)
+                if not log.named:
+                    raise self._no_header(log)
+            except InputError as error:
+                if files.chosen:
+                    raise
+                faults.append(error)
+                self._leave_out(files.name(path), error, path)
+                continue
+            logs[files.name(path)] = log
+        if not logs:
+            raise faults[0]
+        return logs
+
+    def _no_header(self, log: Log) -> InputError:
+        """What to say of a table whose first row are numbers."""
+        count = len(log.names())
+        names = ["t", *(f"{joint.name}_pos" for joint in self.joints)]
+        shown = ",".join(names[:MOST_NAMES])
+        return InputError(
+            f"{log.path}, row {log.first}: expected a header that names the {count} columns, found "
+            f"numbers; put one above, such as {shown},..."
+        )
+
+    def _leave_out(self, name: str, error: InputError, path: Path) -> None:
+        text = str(error).removeprefix(str(path)).lstrip(",: ")
+        self.made_of.untold.append(f"{name}: {text}; left out")
+
+    def _timed(self, logs: dict[str, Log]) -> list[Column]:
+        """The columns of all files that have stamps of one name and unit, stamps left out."""
+        if self.options.rate is not None:
+            return self._at_rate(logs, self.options.rate)
+        clocks = self._clocks(logs)
+        names = [{column.name for column, _ in own} for own in clocks.values()]
+        # One name that all files have, if there is one: what a header says before when it came.
+        common = set.intersection(*names) if names else set()
+        chosen = {
+            file: next((pair for pair in own if pair[0].name in common), own[0])
+            for file, own in clocks.items()
+        }
+        counts: dict[tuple[str, str], int] = {}
+        for file, (column, unit) in chosen.items():
+            known_ = [c for c in self._columns(file, logs[file]) if guess.role_of(c)]
+            key = column.name, unit
+            counts[key] = counts.get(key, 0) + len(known_)
+        self.time, self.unit = max(counts, key=lambda key: counts[key])
+        zero = min(float(column.values[0]) for column, _ in chosen.values())
+        for file, (column, unit) in chosen.items():
+            if (column.name, unit) != (self.time, self.unit):
+                self._other_clock(file, logs[file], f"{column.name} ({unit})")
+                continue
+            # Clocks of robots count from 1970: what is left of a second there is coarse.
+            own = column.values - column.values[0]
+            self.seconds[file] = guess.UNITS[unit] * own
+            self._starts[file] = guess.UNITS[unit] * float(column.values[0] - zero)
+            repeated = int((np.diff(own) == 0).sum())
+            if repeated:
+                self.made_of.untold.append(
+                    f"{file}: {repeated} of {own.size} stamps repeat the one before; their rows "
+                    "are left out"
                 )
-            unit = guess.unit_of_time(time.values)
-            if unit is None:
-                interval = float(np.median(np.diff(time.values)))
-                raise InputError(
-                    f"{log.path}, column {time.name}: stamps {interval:g} apart are no log's in s, "
-                    "ms, us or ns"
+        steps = np.diff(next(iter(self.seconds.values())))
+        rate = 1.0 / float(np.median(steps[steps > 0]))
+        self.made_of.guessed.append(f"time: column {self.time} in {self.unit}, {rate:.4g} Hz")
+        return self._with_numbers(logs)
+
+    def _at_rate(self, logs: dict[str, Log], rate: float) -> list[Column]:
+        """The columns of all files whose rows are at a rate that the user states."""
+        for file, log in logs.items():
+            count = max(log.column(name).size for name in log.names())
+            self.seconds[file] = np.arange(count) / rate
+            self._starts[file] = 0.0
+        return self._with_numbers(logs)
+
+    def _clocks(self, logs: dict[str, Log]) -> dict[str, list[tuple[Column, str]]]:
+        """Of each file the columns that may be its stamps, with their units.
+
+        Raises:
+            InputError: a file that the user named has none, or none has.
+        """
+        found: dict[str, list[tuple[Column, str]]] = {}
+        faults: list[InputError] = []
+        for file, log in logs.items():
+            columns = guess.clocks(self._columns(file, log))
+            units = [(column, self._unit_of_time(column)) for column in columns]
+            own = [(column, unit) for column, unit in units if unit is not None]
+            if own:
+                found[file] = own
+                continue
+            if columns:
+                steps = np.diff(columns[0].values)
+                interval = float(np.median(steps[steps > 0]))
+                error = InputError(
+                    f"{log.path}, column {columns[0].name}: stamps {interval:g} apart are no log's "
+                    "in s, ms, us or ns"
                 )
-            found.setdefault(time.name, unit)
-            self.seconds[file] = guess.UNITS[unit] * (time.values - time.values[0])
-            if len(found) > 1 or found.get(time.name) != unit:
-                raise InputError(
-                    f"{log.path}: its stamps are called {time.name} ({unit}), those of the files "
-                    f"before {', '.join(f'{n} ({u})' for n, u in found.items())}; "
-                    "give them one name"
+            else:
+                error = InputError(
+                    f"{log.path}: no column increases from row to row; expected one of stamps; "
+                    "state the rate of the rows with --rate HZ if there is none"
                 )
-        ((name, unit),) = found.items()
-        rate = 1.0 / float(np.median(np.diff(next(iter(self.seconds.values())))))
-        self.made_of.guessed.append(f"time: column {name} in {unit}, {rate:.4g} Hz")
-        return name, unit
+            if next(iter(self.runs.values())).chosen:
+                raise error
+            faults.append(error)
+            self._leave_out(file, error, log.path)
+        if not found:
+            raise faults[0]
+        return found
+
+    @staticmethod
+    def _unit_of_time(column: Column) -> str | None:
+        """The unit of stamps: as the file states it, else the one that makes them a log's."""
+        if column.quantity == "time" and column.unit in guess.UNITS:
+            return column.unit
+        return guess.unit_of_time(column.values)
+
+    def _other_clock(self, file: str, log: Log, clock: str) -> None:
+        """Leave out a file whose stamps have another name or unit than those of the others.
+
+        Raises:
+            InputError: the user named it.
+        """
+        error = InputError(
+            f"{log.path}: its stamps are called {clock}, those of the files before "
+            f"{self.time} ({self.unit}); give them one name"
+        )
+        if next(iter(self.runs.values())).chosen:
+            raise error
+        self._leave_out(file, error, log.path)
+
+    @staticmethod
+    def _columns(file: str, log: Log) -> list[Column]:
+        """All columns of numbers of a log."""
+        return [
+            Column(file, name, np.where(np.isfinite(values), values, np.nan),
+                   log.units.get(name, ""))
+            for name in log.names()
+            for values in (log.column(name),)
+        ]  # fmt: skip
+
+    def _with_numbers(self, logs: dict[str, Log]) -> list[Column]:
+        """The columns of the files with stamps that have a number for each of these."""
+        columns = []
+        for file, seconds in self.seconds.items():
+            for column in self._columns(file, logs[file]):
+                if column.name == self.time:
+                    continue
+                if column.values.size != seconds.size:
+                    self._untold(column, f"has {column.values.size} numbers, not {seconds.size}")
+                elif np.isnan(column.values).all():
+                    self._untold(column, "has no number")
+                else:
+                    columns.append(column)
+        return columns
+
+    # -- columns
 
     def _by_joint(self, columns: Sequence[Column]) -> list[tuple[Column, Joint, str]]:
         """Columns of one kind with their joints, and why."""
@@ -236,113 +387,508 @@ class _Describing:
                 plain.append(column)
         groups: dict[tuple[str, str], list[Column]] = {}
         for column in plain:
-            groups.setdefault((column.file, column.name.rstrip("0123456789[]")), []).append(column)
+            groups.setdefault((column.file, column.bare.rstrip("0123456789[]")), []).append(column)
         for group in groups.values():
             numbered = guess.numbered(group, self.joints)
             for column in group:
                 if column.name in numbered:
-                    found.append((column, numbered[column.name], "by the model's order of joints"))
+                    found.append((column, numbered[column.name], _BY_ORDER))
         return found
+
+    def _say_normalised(self, columns: Sequence[Column]) -> None:
+        """Tell whether positions are normalised, and say what cannot be told."""
+        mine = [c for c in columns if guess.role_of(c) in ("position", None) and not c.unit]
+        placed = [(c, j) for c, j, _ in self._by_joint(mine)]
+        if not placed:
+            return
+        path = next(iter(self.runs.values())).paths[0]
+        # An episode has one log; other runs may hold larger positions than the first.
+        largest = max(self._largest(c) for c, _ in placed)
+        options = self.options
+        self.normalised = normalised_positions(
+            path, largest, options.position_unit, options.calibration
+        )
+        if self.normalised is not None:
+            self.made_of.guessed.append(f"positions: {self.normalised.says()}")
+        elif (
+            not options.position_unit
+            and largest <= LARGEST
+            and is_lerobot(path, (c.name for c, _ in placed))
+            and any(guess.unit_of_position(c.values, j) in ("deg", None) for c, j in placed)
+        ):
+            self.made_of.checks.append(
+                "positions lie within -100 to 100: they are taken for degrees and may be LeRobot's "
+                f"normalised positions; {REMEDY}"
+            )
+
+    def _largest(self, column: Column) -> float:
+        """The largest magnitude of a column in some runs."""
+        values = [float(np.nanmax(np.abs(column.values)))]
+        for run in list(self.runs)[1:MOST_RUNS]:
+            paths = [p for p in self.runs[run].paths if self.runs[run].name(p) == column.file]
+            if paths and column.name in (log := self._log(paths[0])).names():
+                values.append(float(np.nanmax(np.abs(log.column(column.name)), initial=0.0)))
+        return max(values)
+
+    def _position_signal(self, column: Column, joint: Joint, why: str) -> Signal | None:
+        """A position, or the command of one, in the unit that is stated or that its range tells."""
+        if column.unit:
+            if not _converts(column.unit, joint.unit):
+                what = "expected an angle" if joint.kind == "hinge" else "expected a length"
+                remedy = "state unit, scale and offset in the description by hand"
+                self._untold(column, f"is in {column.unit}, {what}; {remedy}")
+                return None
+            by = "the row of units" if column.units_row else "its name"
+            return Signal(column, column.unit, f"{why}; in {column.unit} by {by}")
+        if self.normalised is not None:
+            found = self.normalised.scale_of(column.name, column.values, joint)
+            if found is None:
+                self._untold(column, f"is normalised, and nothing says the range of {joint.name}")
+                return None
+            unit, (gain, offset) = found
+            return Signal(column, unit, f"{why}; normalised", gain, offset)
+        if self.options.position_unit and joint.kind == "hinge":
+            unit = self.options.position_unit
+            return Signal(column, unit, f"{why}; in {unit} as the user states")
+        told = guess.unit_of_position(column.values, joint)
+        if told is None:
+            low, high = joint.range or (-np.inf, np.inf)
+            ends = f"{np.nanmin(column.values):.4g} to {np.nanmax(column.values):.4g}"
+            self._untold(column, f"goes from {ends}, {joint.name} from {low:.4g} to {high:.4g}")
+            return None
+        return Signal(column, told, f"{why}; in {told} by its range")
 
     def _positions(self, columns: Sequence[Column]) -> None:
         mine = [c for c in columns if guess.role_of(c) in ("position", None)]
         for column, joint, why in self._by_joint(mine):
-            unit = guess.unit_of_position(column.values, joint)
             name = f"q.{joint.name}"
-            if unit is None:
-                low, high = joint.range or (-np.inf, np.inf)
-                ends = f"{np.nanmin(column.values):.4g} to {np.nanmax(column.values):.4g}"
-                self._untold(column, f"goes from {ends}, {joint.name} from {low:.4g} to {high:.4g}")
-            elif name in self.channels:
-                self._untold(column, f"{name} is {self.channels[name][0].name} already")
-            else:
-                self.channels[name] = column, unit, f"{why}; in {unit} by its range"
-
-    def _rates(self, columns: Sequence[Column]) -> None:
-        mine = [c for c in columns if guess.role_of(c) == "velocity"]
-        for column, joint, why in self._by_joint(mine):
-            position = self.channels.get(f"q.{joint.name}")
-            if guess.still(column.values):
-                self._untold(column, "never changes")
-            elif position is None or position[0].file != column.file:
-                self._untold(column, f"no position of {joint.name} beside it tells its unit")
-            else:
-                own, unit, _ = position
-                rate = guess.unit_of_rate(column.values, own.values, self.seconds[own.file], unit)
-                late = self._late(own, column)
-                if rate is None:
-                    self._untold(column, f"is not the derivative of {own.name}")
-                elif late is not None:
-                    behind = f"{late.samples:.2g} samples {late.word} the derivative of {own.name}"
-                    self._untold(column, f"is {behind}, filtered or stamped at another time")
-                else:
-                    says = f"{why}; in {rate}, as the derivative of {own.name}"
-                    self.channels[f"qd.{joint.name}"] = column, rate, says
-
-    def _late(self, position: Column, rate: Column) -> rates.Late | None:
-        """Whether a velocity follows behind its position, of which a model would make a cause."""
-        times = self.seconds[position.file]
-        shown = {"q": position.values, "v": rate.values}
-        return rates.late([Run("", times, shown, {}, {}, {}, False)], "q", "v")
+            if name in self.channels:
+                self._untold(column, f"{name} is {self.channels[name].column.name} already")
+                continue
+            signal = self._position_signal(column, joint, why)
+            if signal is not None:
+                self.channels[name] = signal
 
     def _commands(self, columns: Sequence[Column]) -> None:
         mine = [c for c in columns if guess.role_of(c) == "command"]
-        actuators = {a.joint: a for a in self.robot.actuators if a.joint}
         for column, joint, why in self._by_joint(mine):
-            own = actuators.get(joint.name)
+            own = self.drives.get(joint.name)
             if own is None and self.robot.actuators:
                 self._untold(column, f"no actuator drives {joint.name}")
-                continue
-            name = own.name if own is not None else f"m_{joint.name}"
-            kind = own.kind if own is not None else "position"
-            unit = guess.unit_of_position(column.values, joint)
-            if kind != "position":
-                unit = joint.force_unit if kind == "motor" else f"{joint.unit}/s"
-            if unit is None or f"u.{name}" in self.inputs:
-                self._untold(column, f"is no command of {joint.name} in rad or deg")
-                continue
-            if own is None:
+            elif own is None:
+                self._command_of_none(column, joint, why)
+            else:
+                self._command(column, joint, why, own)
+
+    def _command_of_none(self, column: Column, joint: Joint, why: str) -> None:
+        """The command of a joint that the model does not drive: of a servo, or a force."""
+        asks = guess.commanded_role(column)
+        if asks == "force":
+            self._force(column, joint, f"force.{joint.name}", why)
+        elif asks in (None, "position"):
+            name = f"m_{joint.name}"
+            signal = self._new_input(f"u.{name}", column, joint, why)
+            if signal is not None:
                 self.added[name] = joint
-            self.inputs[f"u.{name}"] = column, unit, f"{why}; in {unit}"
+        else:
+            self._untold(column, f"asks for a {asks} of {joint.name}, which no actuator takes")
+
+    def _command(self, column: Column, joint: Joint, why: str, own: Actuator) -> None:
+        """The command of an actuator, if it asks for what the actuator takes."""
+        asks = guess.commanded_role(column)
+        takes = {"motor": "force", "position": "position", "velocity": "velocity"}.get(own.kind)
+        if own.kind == "motor" and asks is None and self._follows(column, joint):
+            asks = "position"
+        if takes is not None and asks is not None and asks != takes:
+            words = {"force": "torque" if joint.kind == "hinge" else "force"}
+            asked, taken = words.get(asks, asks), words.get(takes, takes)
+            self._untold(
+                column, f"is a desired {asked} of {joint.name}, and {own.name} takes a {taken}"
+            )
+        elif own.kind == "motor":
+            self._force(column, joint, f"u.{own.name}", why)
+        elif own.kind == "position":
+            self._new_input(f"u.{own.name}", column, joint, why)
+        else:
+            unit = column.unit if _converts(column.unit, f"{joint.unit}/s") else f"{joint.unit}/s"
+            self._take(f"u.{own.name}", Signal(column, unit, f"{why}; in {unit}"))
+
+    def _follows(self, column: Column, joint: Joint) -> bool:
+        """Whether a command is like the position of its joint, as a desired position is."""
+        there = self.channels.get(f"q.{joint.name}")
+        if there is None:
+            return False
+        u, q = self._held(column, there.column)
+        seen = np.isfinite(u) & np.isfinite(q)
+        u, q = u[seen], q[seen]
+        if u.size < 3 or np.ptp(u) == 0 or np.ptp(q) == 0:
+            return False
+        # A torque may follow a position, too, but not its mean and its size.
+        apart = float(np.sqrt(np.mean((u - q) ** 2)))
+        return bool(np.corrcoef(u, q)[0, 1] > FOLLOWS and apart < 0.5 * float(np.std(q)))
+
+    def _force(self, column: Column, joint: Joint, name: str, why: str) -> None:
+        """A torque of a motor, or along a joint."""
+        unit = column.unit or joint.force_unit
+        if not _converts(unit, joint.force_unit):
+            self._untold(column, f"is in {unit}, expected {joint.force_unit}")
+            return
+        by = "as its file states" if column.unit else "which no file states"
+        self._take(name, Signal(column, unit, f"{why}; in {unit}, {by}"))
+
+    def _new_input(self, name: str, column: Column, joint: Joint, why: str) -> Signal | None:
+        """The command of a servo's position."""
+        if name in self.inputs:
+            self._untold(column, f"{name} is {self.inputs[name].column.name} already")
+            return None
+        signal = self._position_signal(column, joint, why)
+        if signal is not None:
+            self.inputs[name] = signal
+        return signal
+
+    def _take(self, name: str, signal: Signal) -> None:
+        """An input, unless there is one of that name."""
+        if name in self.inputs:
+            self._untold(signal.column, f"{name} is {self.inputs[name].column.name} already")
+        else:
+            self.inputs[name] = signal
+
+    # -- order of joints
+
+    def _order(self) -> dict[str, str]:
+        """Check each position against its command where the order of joints is a guess.
+
+        Returns:
+            By joint, the joint of whose place its column is, where positions were exchanged.
+        """
+        servos = {
+            joint.name: name
+            for joint in self.joints
+            for name in (self._servo(joint),)
+            if name in self.inputs and f"q.{joint.name}" in self.channels
+        }
+        joints = list(servos)
+        commands = [self.inputs[servos[joint]] for joint in joints]
+        positions = [self.channels[f"q.{joint}"] for joint in joints]
+        guessed = [_BY_ORDER in s.why for s in commands], [_BY_ORDER in s.why for s in positions]
+        if len(joints) > 1 and (any(guessed[0]) or any(guessed[1])):
+            held = [
+                self._held(command.column, position.column)
+                for command, position in zip(commands, positions, strict=True)
+            ]
+            # All positions of a file have the same instants; those of several may not.
+            if len({u.size for u, _ in held}) == 1:
+                units = [self.robot.joint(joint).unit for joint in joints]
+                u = [c.si(unit, v) for c, unit, (v, _) in zip(commands, units, held, strict=True)]
+                q = [c.si(unit, v) for c, unit, (_, v) in zip(positions, units, held, strict=True)]
+                moved = self._reorder(joints, servos, guessed, u, q)
+                follows = follow(u, q) or bool(moved)
+                if all(guessed[0]) and all(guessed[1]) and follows and not moved:
+                    preferred = self._prefer(joints, servos, u, q)
+                    if preferred:
+                        return preferred
+                self._say_order(joints, follows)
+                return moved if all(guessed[1]) and not all(guessed[0]) else {}
+        self._say_order(joints, False)
+        return {}
+
+    def _servo(self, joint: Joint) -> str:
+        """The input of the position servo of a joint; empty where it has none."""
+        own = self.drives.get(joint.name)
+        if own is not None:
+            return f"u.{own.name}" if own.kind == "position" else ""
+        return f"u.m_{joint.name}" if f"m_{joint.name}" in self.added else ""
+
+    def _reorder(
+        self,
+        joints: Sequence[str],
+        servos: Mapping[str, str],
+        guessed: tuple[Sequence[bool], Sequence[bool]],
+        commands: Sequence[Array],
+        positions: Sequence[Array],
+    ) -> dict[str, str]:
+        """Exchange columns whose order is a guess, if positions follow the commands better then."""
+        order = order_of_commands(commands, positions)
+        if order is None or not (all(guessed[0]) or all(guessed[1])):
+            return {}
+        why = _BY_COMMANDS
+        if all(guessed[0]):
+            own = {joint: self.inputs[servos[joint]] for joint in joints}
+            for place, joint in zip(order, joints, strict=True):
+                signal = own[joint]
+                told = signal.why.replace(_BY_ORDER, why)
+                self.inputs[servos[joints[place]]] = replace(signal, why=told)
+        else:
+            own = {joint: self.channels[f"q.{joint}"] for joint in joints}
+            for place, joint in zip(order, joints, strict=True):
+                signal = own[joints[place]]
+                told = signal.why.replace(_BY_ORDER, why)
+                self.channels[f"q.{joint}"] = replace(signal, why=told)
+        return {joint: joints[place] for place, joint in zip(order, joints, strict=True)}
+
+    def _prefer(
+        self,
+        joints: Sequence[str],
+        servos: Mapping[str, str],
+        commands: Sequence[Array],
+        positions: Sequence[Array],
+    ) -> dict[str, str]:
+        """Exchange columns without names if the model explains the motion far better then.
+
+        Returns:
+            By joint, the joint of whose place its column is; nothing where the order stays.
+        """
+        drives = [self.drives.get(joint) for joint in joints]
+        driven = [
+            (self.robot.joint(joint), drive)
+            for joint, drive in zip(joints, drives, strict=True)
+            if drive is not None
+        ]
+        # Gains that nobody knows explain nothing, and normalised numbers belong to their joints.
+        if len(driven) < len(joints) or self.normalised is not None:
+            return {}
+        if all(map(self._has_its_number, joints)):
+            return {}
+        seconds = self.seconds[self.channels[f"q.{joints[0]}"].column.file]
+        told = preferred_order(self.robot, driven, seconds, commands, positions)
+        if told is None or not told.is_certain():
+            return {}
+        own = {joint: (self.channels[f"q.{joint}"], self.inputs[servos[joint]]) for joint in joints}
+        moved = {joint: joints[place] for joint, place in zip(joints, told.order, strict=True)}
+        for joint, other in moved.items():
+            for table, name, signal in zip(
+                (self.channels, self.inputs), (f"q.{joint}", servos[joint]), own[other], strict=True
+            ):
+                table[name] = replace(signal, why=signal.why.replace(_BY_ORDER, _BY_MODEL))
+        columns = sorted(joints, key=lambda joint: told.order[joints.index(joint)])
+        self.made_of.checks.append(
+            "order of joints: the log does not name those of its columns; they are taken in the "
+            f"order {', '.join(columns)}, in which the model explains the motion best (a residual "
+            f"of {told.residual:.2g} of the drives' forces, {told.usual:.2g} in the model's order, "
+            f"{', '.join(joints)}); it is a guess: compare it with the logger's order"
+        )
+        return moved
+
+    def _say_order(self, joints: Sequence[str], follows: bool) -> None:
+        """Say whether positions follow their commands, and that an order is a guess where nothing
+        but the model's order tells it.
+
+        Args:
+            joints: with a servo, a command and a position.
+            follows: whether each of these positions follows the command of its own joint.
+        """
+        guessed: dict[str, set[str]] = {}
+        for table in (self.channels, self.inputs):
+            for name, signal in table.items():
+                if _BY_ORDER not in signal.why and _BY_COMMANDS not in signal.why:
+                    continue
+                if follows and _BY_ORDER in signal.why and self._driven(name) in joints:
+                    told = signal.why.replace(_BY_ORDER, f"{_BY_ORDER} (each follows its command)")
+                    table[name] = replace(signal, why=told)
+                guessed.setdefault(name.partition(".")[0], set()).add(self._driven(name))
+        positions, commands = guessed.get("q", set()), guessed.get("u", set())
+        # What follows a command that its log names, or is followed by a named position, is told.
+        if follows and not (positions & commands):
+            return
+        doubted = positions | commands
+        named = [joint.name for joint in self.joints if joint.name in doubted]
+        if len(named) < 2 or all(map(self._has_its_number, named)):
+            return
+        model, alphabet = ", ".join(named[:MOST_NAMES]), ", ".join(sorted(named)[:MOST_NAMES])
+        other = f" (sorted by name, as ROS drivers have it, they would be {alphabet})"
+        what = "columns" if positions else "commands"
+        self.made_of.checks.append(
+            f"order of joints: the log does not name those of its {what}; they are taken in the "
+            f"model's order, {model}, which is a guess{other if model != alphabet else ''}; if "
+            "another order is right, exchange the `column` lines"
+        )
+
+    def _driven(self, signal: str) -> str:
+        """The joint of a channel or an input; its own name where it has none."""
+        name = signal.partition(".")[2]
+        own = next((a.joint for a in self.robot.actuators if a.name == name), None)
+        added = self.added.get(name)
+        return own or (added.name if added is not None else name)
+
+    def _has_its_number(self, joint: str) -> bool:
+        """Whether the number of a position's column stands in its joint's name."""
+        own, column = (
+            [int(digits) for digits in re.findall(r"\d+", text)]
+            for text in (joint, self._column_of(joint))
+        )
+        return bool(own and column and own[-1] == column[-1])
+
+    def _column_of(self, joint: str) -> str:
+        """The name of the column of a joint's position, or else of its command."""
+        position = self.channels.get(f"q.{joint}")
+        if position is not None and _BY_ORDER in position.why:
+            return position.column.bare
+        own = (s for name, s in self.inputs.items() if self._driven(name) == joint)
+        return next((signal.column.bare for signal in own), "")
+
+    def _held(self, command: Column, position: Column) -> tuple[Array, Array]:
+        """(T,) a command at the instants of a position, each held until the next, and that."""
+        u, q = self.seconds[command.file], self.seconds[position.file]
+        if command.file == position.file:
+            return command.values, position.values
+        offset = self._starts[command.file] - self._starts[position.file]
+        places = np.searchsorted(u + offset, q, side="right") - 1
+        return command.values[np.clip(places, 0, u.size - 1)], position.values
+
+    # -- velocities and forces
+
+    def _rates(self, columns: Sequence[Column], moved: Mapping[str, str]) -> None:
+        mine = [c for c in columns if guess.role_of(c) == "velocity"]
+        placed = self._by_joint(mine)
+        by_place = {joint.name: column for column, joint, why in placed if why == _BY_ORDER}
+        for own, joint, told in placed:
+            column, why = own, told
+            if why == _BY_ORDER and joint.name in moved:
+                column = by_place.get(moved[joint.name], own)
+                why = "in the order of the positions"
+            position = self.channels.get(f"q.{joint.name}")
+            if guess.still(column.values):
+                self._untold(column, "never changes")
+            elif position is None or position.column.file != column.file:
+                self._untold(column, f"no position of {joint.name} beside it tells its unit")
+            elif f"qd.{joint.name}" in self.channels:
+                there = self.channels[f"qd.{joint.name}"].column.name
+                self._untold(column, f"qd.{joint.name} is {there} already")
+            else:
+                self._rate(column, joint, why, position)
+
+    def _rate(self, column: Column, joint: Joint, why: str, position: Signal) -> None:
+        """A velocity, if it is the derivative of its position and not behind it."""
+        name, seconds = position.column.name, self.seconds[column.file]
+        stated = column.unit if _converts(column.unit, f"{joint.unit}/s") else ""
+        first = np.diff(seconds, prepend=-np.inf) > 0
+        angles = position.si(joint.unit, position.column.values)
+        slope = np.gradient(angles[first], seconds[first])
+        unit = guess.unit_of_rate(column.values[first], slope, joint, stated)
+        if unit is None:
+            self._untold(column, f"is not the derivative of {name}")
+            return
+        shown = {"q": position.column.values[first], "v": column.values[first]}
+        late = rates.late([Run("", seconds[first], shown, {}, {}, {}, False)], "q", "v")
+        if late is not None:
+            behind = f"{late.samples:.2g} samples {late.word} the derivative of {name}"
+            self._untold(column, f"is {behind}, filtered or stamped at another time")
+            return
+        if stated and unit != stated:
+            self._untold(column, f"is in {stated} by its name and in {unit} by {name}")
+            return
+        self.channels[f"qd.{joint.name}"] = Signal(
+            column, unit, f"{why}; in {unit}, as the derivative of {name}"
+        )
+
+    def _efforts(self, columns: Sequence[Column]) -> None:
+        """Measured torques as inputs where nothing commands a motor, or a joint without drive."""
+        mine = [c for c in columns if guess.role_of(c) == "force" and _is_torque(c)]
+        torques: dict[str, list[tuple[Column, Joint, str]]] = {}
+        for column, joint, why in self._by_joint(mine):
+            own = self.drives.get(joint.name)
+            if own is not None and own.kind == "motor":
+                name = f"u.{own.name}"
+            elif own is None and f"m_{joint.name}" not in self.added and not self.robot.actuators:
+                name = f"force.{joint.name}"
+            else:
+                continue
+            if name not in self.inputs:
+                torques.setdefault(name, []).append((column, joint, why))
+        for name, found in torques.items():
+            measured = [one for one in found if guess.is_measured(one[0])]
+            # What a controller asked for and what friction took may be torques of a log, too.
+            if len(found) > 1 and len(measured) != 1:
+                continue
+            ((column, joint, why),) = measured if len(found) > 1 else found
+            self._force(column, joint, name, f"{why}, measured, as nothing commands it")
+
+    # -- what is said
 
     def _untold(self, column: Column, why: str) -> None:
         self.made_of.untold.append(f"{column.file}, column {column.name}: {why}; left out")
 
+    def _say_inputs(self, columns: Sequence[Column]) -> None:
+        """Say which actuators, or joints, get no input."""
+        idle = [a for a in self.robot.actuators if f"u.{a.name}" not in self.inputs]
+        if self.inputs and not idle:
+            return
+        if self.robot.actuators and not idle:
+            return
+        names = ", ".join(a.name for a in idle[:MOST_NAMES])
+        what = "the model has no input, so that nothing drives it"
+        if idle:
+            what = f"actuators without an input: {names}; their commands are taken for 0"
+        used = {(s.column.file, s.column.name) for s in self.inputs.values()}
+        perhaps = [
+            c.name
+            for c in columns
+            if guess.role_of(c) in ("command", "force") and (c.file, c.name) not in used
+        ]
+        columns_ = f"columns that may be it: {', '.join(perhaps[:6])}; " if perhaps else ""
+        table = (
+            f'[inputs."u.{idle[0].name}"]' if idle else f'[inputs."force.{self.joints[0].name}"]'
+        )
+        self.made_of.checks.append(f"{what}; {columns_}add {table} with file, column and unit")
+
     def _say_rest(self, columns: Sequence[Column]) -> None:
         """Columns of which nothing has been said."""
-        used = {(c.file, c.name) for c, *_ in (*self.channels.values(), *self.inputs.values())}
+        signals = (*self.channels.values(), *self.inputs.values())
+        used = {(s.column.file, s.column.name) for s in signals}
         said = " ".join(self.made_of.untold)
         for column in columns:
             if (column.file, column.name) in used or f"column {column.name}:" in said:
                 continue
-            force = guess.role_of(column) == "force"
+            force = guess.role_of(column) == "force" and not column.unit
             why = "its unit cannot be told" if force else "what it is cannot be told"
+            if column.unit and guess.role_of(column) == "force":
+                why = f"is in {column.unit}; no input of the model takes it"
             self._untold(column, why)
         missing = [j.name for j in self.joints if f"q.{j.name}" not in self.channels]
         if missing:
             self.made_of.untold.append(f"joints without a position: {', '.join(missing)}")
 
-    def _text(self, time: str, unit: str) -> str:
-        lines = [f"model = {_quoted(self._from(self.model))}"]
+    def _text(self) -> str:
+        lines = [*(f"# check: {line}" for line in self.made_of.checks)]
+        lines += [f"model = {_quoted(self._from(self.model))}"]
         if self.added:
             names = ", ".join(_quoted(f"{name}@*") for name in _GAINS)
             lines.append(f"free = [{names}]  # not known: they are estimated")
-        lines.append("")
-        lines += ["[time]", f"column = {_quoted(time)}", f"unit = {_quoted(unit)}  # guess", ""]
+        lines += ["", "[time]"]
+        if self.options.rate is not None:
+            lines += [f"rate = {float(self.options.rate)!r}", ""]
+        else:
+            lines += [f"column = {_quoted(self.time)}", f"unit = {_quoted(self.unit)}  # guess", ""]
         for run, files in self.runs.items():
             if run:
-                lines += [f"[runs.{_key(run)}]", f"folder = {_quoted(self._from(files.folder))}"]
-                lines += [*["held_out = true"] * (run in self.held_out), ""]
-        alone = self.runs[""].folder if "" in self.runs else None
+                where = files.paths[0] if files.alone else files.folder
+                word = "file" if files.alone else "folder"
+                lines += [f"[runs.{_key(run)}]", f"{word} = {_quoted(self._from(where))}"]
+                lines += [*["held_out = true"] * (run in self.options.held_out), ""]
         for name, joint in self.added.items():
             lines += self._actuator(name, joint)
         for kind, signals in (("channels", self.channels), ("inputs", self.inputs)):
-            for name, (column, of, why) in signals.items():
-                file = self._from(alone / column.file) if alone is not None else column.file
-                lines += [f"[{kind}.{_quoted(name)}]  # guess: {why}", f"file = {_quoted(file)}"]
-                lines += [f"column = {_quoted(column.name)}", f"unit = {_quoted(of)}", ""]
-                self.made_of.guessed.append(f"{name}: {column.file}, column {column.name}, {why}")
+            for name, signal in signals.items():
+                lines += self._signal_lines(kind, name, signal)
         return "\n".join(lines).rstrip("\n") + "\n"
+
+    def _signal_lines(self, kind: str, name: str, signal: Signal) -> list[str]:
+        """The table of a channel or an input."""
+        column = signal.column
+        lines = [f"[{kind}.{_quoted(name)}]  # guess: {signal.why}"]
+        first = next(iter(self.runs.values()))
+        if not first.alone:
+            inside = self.runs[""].folder / column.file if "" in self.runs else None
+            file = self._from(inside) if inside is not None else column.file
+            lines.append(f"file = {_quoted(file)}")
+        lines += [f"column = {_quoted(column.name)}", f"unit = {_quoted(signal.unit)}"]
+        stated = self.options.position_unit == "deg" and kind == "channels"
+        if signal.scale != 1.0 or (stated and name.startswith("q.")):
+            lines.append(f"scale = {signal.scale!r}")
+        if signal.offset:
+            lines.append(f"offset = {signal.offset!r}")
+        self.made_of.guessed.append(f"{name}: {column.file}, column {column.name}, {signal.why}")
+        return [*lines, ""]
 
     def _actuator(self, name: str, joint: Joint) -> list[str]:
         """A servo whose gains nobody knows."""
@@ -361,33 +907,37 @@ class _Describing:
 
     def _following(self, name: str, joint: Joint) -> Following | None:
         """How a joint follows the command of its servo, over all runs."""
-        (u, unit, _), there = self.inputs[f"u.{name}"], self.channels.get(f"q.{joint.name}")
-        if there is None:
+        u, q = self.inputs[f"u.{name}"], self.channels.get(f"q.{joint.name}")
+        if q is None:
             return None
-        q, own, _ = there
-        sizes = {"deg": np.pi / 180.0, "mm": 1e-3}
         shown = []
         for run in self.runs:
-            command, position = self._signal(run, u), self._signal(run, q)
+            command, position = self._signal(run, u.column), self._signal(run, q.column)
             if command is None or position is None:
                 continue
             # A command holds until the next one.
             held = np.searchsorted(command[0], position[0], side="right") - 1
             values = command[1][np.clip(held, 0, command[1].size - 1)]
-            scaled = sizes.get(unit, 1.0) * values, sizes.get(own, 1.0) * position[1]
-            shown.append((position[0], *scaled))
+            shown.append((position[0], u.si(joint.unit, values), q.si(joint.unit, position[1])))
         return following(shown)
 
     def _signal(self, run: str, column: Column) -> tuple[Array, Array] | None:
         """Stamps in s and values of a column in one run; None where it lacks the file or that."""
         files = self.runs[run]
-        paths = [path for path in files.paths if files.name(path) == column.file]
+        paths = files.paths if files.alone else [
+            path for path in files.paths if files.name(path) == column.file
+        ]  # fmt: skip
         if not paths:
             return None
         log = self._log(paths[0])
-        if not {column.name, self.time} <= set(log.names()):
+        if column.name not in log.names():
             return None
-        return guess.UNITS[self.unit] * log.column(self.time), log.column(column.name)
+        values = log.column(column.name)
+        if self.options.rate is not None:
+            return np.arange(values.size) / self.options.rate, values
+        if self.time not in log.names():
+            return None
+        return guess.UNITS[self.unit] * log.column(self.time), values
 
     def _log(self, path: Path) -> Log:
         """A log, read once."""
@@ -400,6 +950,23 @@ class _Describing:
             return Path(os.path.relpath(path, self.beside)).as_posix()
         except ValueError:  # on another drive
             return path.resolve().as_posix()
+
+
+def _is_torque(column: Column) -> bool:
+    """Whether a measured column is a torque or a force rather than a current or a load."""
+    if column.unit:
+        return column.quantity in ("torque", "force")
+    vague = {"current", "currents", "load", "loads", "strom"}
+    return bool(set(guess.words_of(column.bare)) & (guess.WORDS["force"] - vague))
+
+
+def _converts(unit: str, target: str) -> bool:
+    """Whether a unit converts to another one."""
+    try:
+        scale(unit, target)
+    except InputError:
+        return False
+    return bool(unit)
 
 
 def _quoted(text: str) -> str:

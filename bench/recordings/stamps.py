@@ -23,6 +23,7 @@ import numpy as np
 
 from bench.recordings import poses
 from bench.recordings.afloat import unplaced
+from bench.recordings.normalised import may_be_normalised
 from bench.recordings.oddity import Oddity
 from bench.sizes import INSIST
 from sims.base import Array, InputError, Simulator
@@ -61,6 +62,7 @@ def refuse_odd(recording: Recording, kind: type[Simulator], force: bool = False)
     """
     # Positions of a wrong unit make stamps look odd, and not the other way round.
     found = [
+        *odd_logs(recording),
         *poses.odd_poses(recording, kind),
         *oddities(recording, kind),
         *unplaced(recording, kind),
@@ -69,6 +71,12 @@ def refuse_odd(recording: Recording, kind: type[Simulator], force: bool = False)
         if oddity.certain and not force:
             raise InputError(f"{recording.path}: {oddity.text}, {INSIST}")
     return [oddity.text for oddity in found]
+
+
+def odd_logs(recording: Recording) -> Iterator[Oddity]:
+    """Yield what was left out of a recording's logs, and units that they do not state."""
+    yield from (Oddity(note, False) for note in recording.notes)
+    yield from may_be_normalised(recording)
 
 
 def oddities(recording: Recording, kind: type[Simulator]) -> Iterator[Oddity]:

@@ -373,7 +373,14 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
     where, usual = f"{kind} {name}", f'unit = "{unit}"'
     own = table(path, where, value, f"a table with {usual}")
     # The noise of a signal that is put in is nothing that a simulation could use.
-    allowed = ("unit", "scale", "column", "file", "noise" if kind == "channel" else "hold")
+    allowed = (
+        "unit",
+        "scale",
+        "offset",
+        "column",
+        "file",
+        "noise" if kind == "channel" else "hold",
+    )
     _known(path, f"{kind}s.{name}", own, allowed)
     # No unit is no SI unit: a log in degrees without a word of it would be read as radians.
     stated = text(path, where, own.get("unit"), f"{usual} or one that converts to it")
@@ -381,12 +388,15 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
         converted = scale(stated, unit)
     except InputError as error:
         raise InputError(f"{path}: {where}: {error}") from None
-    if "scale" not in own:
+    if not {"scale", "offset"} & own.keys():
         return _Column(converted, own)
-    factor = finite(path, f"{kind}s.{name}.scale", own["scale"])
+    factor = finite(path, f"{kind}s.{name}.scale", own.get("scale", 1.0))
     if factor == 0:
         raise fault(path, f"{kind}s.{name}.scale", "a factor that is not zero", own["scale"])
-    return _Column(Scale(factor * converted.gain, converted.offset), own)
+    # The offset is in the unit that is stated: a zero of an encoder reads as it is written there.
+    offset = finite(path, f"{kind}s.{name}.offset", own.get("offset", 0.0))
+    gain = factor * converted.gain
+    return _Column(Scale(gain, converted.gain * offset + converted.offset), own)
 
 
 def _hold(path: Path, name: str, column: _Column) -> bool:
@@ -454,7 +464,7 @@ def _run(path: Path, name: str, value: Any, declared: Declared) -> RunMarks:
     where = f"runs.{name}"
     own = table(path, where, value)
     allowed = [c.name for c in declared.constants]
-    _known(path, where, own, ("constants", "initial", "held_out", "folder", *allowed))
+    _known(path, where, own, ("constants", "initial", "held_out", "folder", "file", *allowed))
     held_out = own.get("held_out")
     if held_out is not None:
         checked(path, f"{where}.held_out", held_out, bool, "true or false")

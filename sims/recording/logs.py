@@ -1,5 +1,5 @@
-"""Logs as their loggers wrote them: a CSV of any layout, a NumPy archive, a Parquet file, a topic
-of a bag, an episode of a dataset.
+"""Logs as their loggers wrote them: a table of text of any layout, a NumPy archive, a Parquet, HDF5
+or PyTorch file, a topic of a bag, an episode of a dataset.
 
 A column is named as the log names it, ``positions[2]`` being the third entry of what holds a list
 or a vector in each row. Nothing is unpickled.
@@ -7,30 +7,39 @@ or a vector in each row. Nothing is unpickled.
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from sims.base import Array, InputError, frozen
 from sims.files import require_file
-from sims.recording import bags, lerobot
-from sims.recording.columnar import WIDEST, columns_of, unreadable
-from sims.user_toml import shown
+from sims.recording import bags, hdf5, lerobot
+from sims.recording.columnar import columns_of, unreadable
+from sims.recording.named_entries import arrays_by_name
+from sims.recording.text_table import read_text_table
 
-FORMATS = (".csv", ".tsv", ".txt", ".npz", ".parquet")
+FORMATS = (
+    ".csv",
+    ".tsv",
+    ".txt",
+    ".dat",
+    ".npz",
+    ".parquet",
+    ".pt",
+    ".pth",
+    ".h5",
+    ".hdf5",
+    ".hdf",
+)
 """What can be read, by the name's ending."""
 LARGEST = 2_000_000_000
 """Bytes of a file: more would not fit beside what is made of it."""
-SEPARATORS = (",", ";", "\t")
-"""Between the cells of a table."""
 _ENTRY = re.compile(r"(?P<base>.*)\[(?P<place>\d{1,5})\]")
-_NUMBERS = re.compile(r"[\[\(](?P<inside>[^\]\)]*)[\]\)]")
 
 
 class Stamp(NamedTuple):
@@ -51,12 +60,21 @@ class Log:
             out.
         texts: names of the columns that hold none.
         rows: which row of the file each row is, for messages.
+        units: by column, where a row of the file states them.
+        unlisted: columns that are left out of `names`, since another one holds the same numbers
+            under the name of their joint.
+        named: whether the file names its columns.
+        first: number of the first of them in the file, for messages.
     """
 
     path: Path
     columns: Mapping[str, Array]
     texts: tuple[str, ...] = ()
     rows: str = "row"
+    units: Mapping[str, str] = field(default_factory=dict)
+    unlisted: frozenset[str] = frozenset()
+    named: bool = True
+    first: int = 2
 
     def column(self, name: str) -> Array:
         """(T,) one column, or one entry of a list.
@@ -102,6 +120,8 @@ class Log:
         """All columns of numbers; those that hold lists by their entries."""
         result = []
         for name, values in self.columns.items():
+            if name in self.unlisted:
+                continue
             if values.ndim == 1:
                 result.append(name)
             else:
@@ -134,6 +154,10 @@ def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> Log:
         abouts = [file.stat() for file in lerobot.files_of(*episode)]
         changed = max(about.st_mtime_ns for about in abouts)
         return _read_episode(Stamp(path, changed, sum(about.st_size for about in abouts)))
+    group = hdf5.group_of(path)
+    if group is not None:
+        about = group[0].stat()
+        return _read_group(Stamp(path, about.st_mtime_ns, about.st_size))
     if bags.is_bag(path):
         there = ", ".join(bags.topics(path))
         raise InputError(f"{path}: a bag; name a topic of it, as {path.name}/TOPIC: {there}")
@@ -169,6 +193,14 @@ def _read_episode(stamp: Stamp) -> Log:
 
 
 @lru_cache(maxsize=8)
+def _read_group(stamp: Stamp) -> Log:
+    """A group of an HDF5 file, read once."""
+    group = hdf5.group_of(stamp.path)
+    assert group is not None  # it is one that was asked for
+    return _of_arrays(stamp.path, *hdf5.read_group(*group))
+
+
+@lru_cache(maxsize=8)
 def _read(stamp: Stamp) -> Log:
     """A log is asked for column by column, and read once."""
     path = stamp.path
@@ -186,95 +218,18 @@ def _read(stamp: Stamp) -> Log:
 
 
 def _table(path: Path) -> Log:
-    """A table whose separator and decimals are found out."""
-    import pandas
-
-    separator = _separator(path)
-    try:
-        cells = pandas.read_csv(
-            path,
-            sep=separator,
-            dtype=str,
-            keep_default_na=False,
-            encoding="utf-8-sig",
-            skipinitialspace=True,
-        )
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected UTF-8 text; save it as UTF-8") from None
-    except (pandas.errors.ParserError, pandas.errors.EmptyDataError, ValueError) as error:
-        what = " ".join(str(error).split())
-        raise InputError(f"{path}: not a table: {what}") from None
-    if cells.shape[1] > WIDEST:
-        raise InputError(f"{path}: expected at most {WIDEST} columns, found {cells.shape[1]}")
-    columns, texts = {}, []
-    for name in cells.columns:
-        values = _numbers(path, str(name), cells[name].to_numpy(dtype=object), separator)
-        if values is None:
-            texts.append(str(name).strip())
-        else:
-            columns[str(name).strip()] = frozen(values)
-    return Log(path, columns, tuple(texts), "row")
-
-
-def _separator(path: Path) -> str:
-    """What divides the header most often outside of quotes and brackets."""
-    with path.open("rb") as file:
-        head = file.readline(1 << 20)
-    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise InputError(f"{path}: expected UTF-8 text, found UTF-16; save it as UTF-8")
-    text = head.decode("utf-8-sig", errors="replace")
-    counts = {mark: len(next(csv.reader([text], delimiter=mark), [])) for mark in SEPARATORS}
-    return max(counts, key=lambda mark: counts[mark])
-
-
-def _numbers(path: Path, name: str, cells: Any, separator: str) -> Array | None:
-    """(T,) or (T, k) numbers; None where the column holds text."""
-    import pandas
-
-    texts = pandas.Series(cells).str.strip()
-    filled = texts[texts != ""]
-    if filled.empty:
-        return np.full(len(texts), np.nan)
-    if _NUMBERS.fullmatch(filled.iloc[0]):
-        return _lists(path, name, texts.tolist())
-    if separator != ",":
-        # Of European tables: a comma within a number.
-        texts = texts.str.replace(",", ".", n=1, regex=False)
-    values = pandas.to_numeric(texts.where(texts != "", "nan"), errors="coerce")
-    result = np.asarray(values, dtype=np.float64)
-    bad = np.flatnonzero(np.isnan(result) & (texts != "").to_numpy() & ~_nan(texts))
-    if bad.size == 0:
-        return result
-    if bad.size > 0.5 * len(filled):
-        return None
-    row = int(bad[0])
-    raise InputError(
-        f"{path}, row {row + 2}, column {name}: expected a number, found {shown(cells[row])}"
+    """A table whose layout is found out."""
+    table = read_text_table(path)
+    return Log(
+        path,
+        table.columns,
+        table.texts,
+        "row",
+        table.units,
+        table.unlisted,
+        table.named,
+        table.first,
     )
-
-
-def _nan(texts: Any) -> Any:
-    """Where a cell says that there is no number."""
-    return texts.str.lower().isin(("nan", "null", "none", "na", "n/a")).to_numpy()
-
-
-def _lists(path: Path, name: str, texts: list[str]) -> Array:
-    """(T, k) of cells such as ``[0.1, 0.2]``."""
-    rows: list[list[float]] = []
-    for number, text in enumerate(texts):
-        match = _NUMBERS.fullmatch(text)
-        try:
-            inside = match["inside"].replace(",", " ").split() if match else None
-            row = [float(part) for part in inside] if inside is not None else None
-        except ValueError:
-            row = None
-        if row is None or (rows and len(row) != len(rows[0])) or len(row) > WIDEST:
-            wanted = f"a list of {len(rows[0])} numbers" if rows else "a list of numbers"
-            raise InputError(
-                f"{path}, row {number + 2}, column {name}: expected {wanted}, found {shown(text)}"
-            )
-        rows.append(row)
-    return np.array(rows, dtype=np.float64).reshape(len(rows), -1)
 
 
 # -- arrays
@@ -284,6 +239,7 @@ def _archive(path: Path) -> Log:
     """The arrays of a NumPy archive, one row an instant."""
     columns: dict[str, Array] = {}
     texts = []
+    names: dict[str, list[str]] = {}
     try:
         # Opened here: what is no archive would be left open by its reader.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
@@ -291,6 +247,8 @@ def _archive(path: Path) -> Log:
                 values = arrays[name]
                 if values.dtype.kind not in "fiub" or not 1 <= values.ndim <= 2:
                     texts.append(name)
+                    if values.dtype.kind == "U" and values.ndim == 1:
+                        names[name] = values.tolist()
                 else:
                     columns[name] = frozen(values.astype(np.float64))
     except (ValueError, EOFError, KeyError, OSError) as error:
@@ -298,7 +256,24 @@ def _archive(path: Path) -> Log:
         raise InputError(f"{path}: not an archive of arrays of numbers: {what}") from None
     except Exception as error:  # the reader of the archive raises what it likes
         raise InputError(f"{path}: not a NumPy archive: {type(error).__name__}") from None
-    return Log(path, columns, tuple(texts), "entry")
+    named, unlisted = arrays_by_name(columns, names)
+    return Log(path, {**columns, **named}, tuple(texts), "entry", unlisted=unlisted)
+
+
+def _of_arrays(path: Path, columns: dict[str, Array], texts: dict[str, list[str]]) -> Log:
+    """Arrays of a file, named by its lists of names where it has some."""
+    if not columns:
+        raise InputError(f"{path}: expected columns of numbers, found none")
+    named, unlisted = arrays_by_name(columns, {name: own for name, own in texts.items() if own})
+    return Log(path, {**columns, **named}, tuple(texts), "entry", unlisted=unlisted, first=0)
+
+
+def _tensors(path: Path) -> Log:
+    """The tensors of a PyTorch file, one row an instant."""
+    # Loaded here alone: few logs are archives of tensors.
+    from sims.recording.torch_tensors import read_tensors
+
+    return _of_arrays(path, *read_tensors(path))
 
 
 def _parquet(path: Path) -> Log:
@@ -318,8 +293,11 @@ _READERS: Mapping[str, Callable[[Path], Log]] = {
     ".csv": _table,
     ".tsv": _table,
     ".txt": _table,
+    ".dat": _table,
     ".npz": _archive,
     ".parquet": _parquet,
+    ".pt": _tensors,
+    ".pth": _tensors,
 }
 
 

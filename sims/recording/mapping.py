@@ -16,10 +16,12 @@ from sims.limits import BRIEFEST, LATEST, NAME
 from sims.recording.logs import Log, read_log
 from sims.recording.table import TableRun
 from sims.recording.units import scale
-from sims.user_toml import finite, known, read_toml, table, text
+from sims.user_toml import fault, finite, known, read_toml, table, text
 
-TIME = ("offset", "column", "unit")
+TIME = ("offset", "column", "unit", "rate")
 """What may stand in `[time]`."""
+MAX_REPEATED = 0.05
+"""Maximum share of the stamps of a log that may repeat the one before; their rows are left out."""
 SAME_INSTANT = 1e-9
 """Seconds by which stamps of two files may differ and be one."""
 
@@ -42,6 +44,8 @@ class Sources:
         offset: seconds by which inputs act later than their stamps say.
         folders: of each run, as seen from the description; none where there is one run.
         stated: whether any of it is said: else the table is one that was written for simgap.
+        rate: Hz, rows in place of stamps; 0 where the logs have stamps.
+        files: by run, the file of the signals that state none, as seen from the run's folder.
     """
 
     signals: Mapping[str, Source]
@@ -50,6 +54,8 @@ class Sources:
     offset: float
     folders: Mapping[str, str] = field(default_factory=dict)
     stated: bool = False
+    rate: float = 0.0
+    files: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_sources(
@@ -73,14 +79,20 @@ def read_sources(
         second = scale(unit, "s").gain
     except InputError as error:
         raise InputError(f"{path}: time.unit: {error}") from None
+    rate = _rate(path, time)
     signals = {}
     for name, own in columns.items():
         file = text(path, f"{name}.file", own.get("file", ""))
         column = text(path, f"{name}.column", own.get("column", name))
         signals[name] = Source(file, column)
-    folders = {}
+    folders, own_files = {}, {}
     for name, marks in table(path, "runs", meta.get("runs", {})).items():
-        if isinstance(marks, dict) and "folder" in marks:
+        if not isinstance(marks, dict):
+            continue
+        if "file" in marks:
+            own_files[name] = text(path, f"runs.{name}.file", marks["file"])
+            folders[name] = ""
+        if "folder" in marks:
             folders[name] = text(path, f"runs.{name}.folder", marks["folder"])
     said = any({"file", "column"} & own.keys() for own in columns.values())
     return Sources(
@@ -89,8 +101,26 @@ def read_sources(
         second,
         finite(path, "time.offset", time.get("offset", 0.0)),
         folders,
-        bool(said or folders or {"column", "unit"} & time.keys()),
+        bool(said or folders or {"column", "unit", "rate"} & time.keys()),
+        rate,
+        own_files,
     )
+
+
+def _rate(path: Path, time: Mapping[str, Any]) -> float:
+    """The rate of logs without stamps, Hz; 0 where they have some."""
+    if "rate" not in time:
+        return 0.0
+    for other in ("column", "unit"):
+        if other in time:
+            raise InputError(
+                f"{path}: time: expected a rate, or column and unit of stamps, found both; leave "
+                "one out"
+            )
+    rate = finite(path, "time.rate", time["rate"])
+    if rate <= 0:
+        raise fault(path, "time.rate", "a number of rows a second, more than 0", time["rate"])
+    return rate
 
 
 def mapped(description: Path) -> list[Path]:
@@ -102,7 +132,7 @@ def mapped(description: Path) -> list[Path]:
         meta = read_toml(description)
     except InputError:
         return []
-    signals = [_named(meta.get(kind), "file") for kind in ("channels", "inputs")]
+    signals = [_named(meta.get(kind), "file") for kind in ("channels", "inputs", "runs")]
     folders = _named(meta.get("runs"), "folder") or [""]
     # A signal without a file is in the table of the description's name in each folder.
     usual = description.with_suffix(".csv").name
@@ -148,7 +178,8 @@ def read_logs(
         here = path.parent / folder
         if len(name) > NAME:
             raise InputError(f"{path}: the name of run {name[:40]}… is too long")
-        parts = _Parts(here, path.name, sources, (*channels, *inputs))
+        usual = sources.files.get(name, path.name)
+        parts = _Parts(here, usual, sources, (*channels, *inputs))
         for own, rows in parts.runs(name):
             runs.append(parts.joined(own, rows, channels, inputs, linear))
     return runs
@@ -162,7 +193,7 @@ class _Parts:
         files = {name: sources.signals[name].file or usual for name in signals}
         wanted: dict[str, set[str]] = {}
         for name, file in files.items():
-            own = wanted.setdefault(file, {sources.time})
+            own = wanted.setdefault(file, set() if sources.rate else {sources.time})
             own.add(sources.signals[name].column)
         self.logs: dict[str, Log] = {
             name: read_log(folder / Path(file), frozenset(wanted[file]))
@@ -190,10 +221,20 @@ class _Parts:
         linear: frozenset[str],
     ) -> TableRun:
         """One run of them."""
-        stamps = {}
+        stamps: dict[Path, Array] = {}
+        # Rows of each file; where a stamp repeats the one before, the first row of it is kept.
+        kept: dict[Path, Any] = {}
+        notes = []
         for log in self.logs.values():
-            if log.path not in stamps:
-                stamps[log.path] = self._stamps(log, rows)
+            if log.path in stamps:
+                continue
+            own, first = self._stamps(log, rows)
+            stamps[log.path] = own[first]
+            chosen = np.arange(own.size) if rows is None else np.flatnonzero(rows)
+            kept[log.path] = chosen[first]
+            if not first.all():
+                repeated = f"{int((~first).sum())} of {own.size} stamps repeat the one before"
+                notes.append(f"{log.path}: {repeated}; their {log.rows}s are left out")
         # Clocks of robots count from 1970: what is left of a second there is too coarse for rates.
         zero = min(own[0] for own in stamps.values())
         stamps = {path: self.sources.second * (own - zero) for path, own in stamps.items()}
@@ -208,7 +249,7 @@ class _Parts:
         columns = {}
         for channel in channels:
             log = self.logs[channel]
-            values = self._values(log, channel, rows)
+            values = self._values(log, channel, kept)
             if not np.isfinite(values).any():
                 raise InputError(f"{log.path}: column {channel} has no sample; leave it out")
             cells = np.full(times.size, np.nan)
@@ -217,22 +258,34 @@ class _Parts:
             cells[places[inside]] = values[inside]
             columns[channel] = frozen(cells)
         for name_, own in zip(inputs, given, strict=True):
-            columns[name_] = frozen(self._given(name_, own, times, rows, name_ in linear))
-        return TableRun(name, frozen(times), columns)
+            columns[name_] = frozen(self._given(name_, own, times, kept, name_ in linear))
+        return TableRun(name, frozen(times), columns, tuple(notes))
 
-    def _values(self, log: Log, signal: str, rows: Array | None) -> Array:
-        values = log.column(self.sources.signals[signal].column)
-        return values if rows is None else values[rows]
+    def _values(self, log: Log, signal: str, kept: Mapping[Path, Any]) -> Array:
+        name = self.sources.signals[signal].column
+        values, rows = log.column(name), kept[log.path]
+        if rows.size and rows[-1] >= values.size:
+            raise InputError(
+                f"{log.path}, column {name}: expected a number for each stamp, found "
+                f"{values.size} numbers and at least {rows[-1] + 1} stamps"
+            )
+        taken: Array = values[rows]
+        return taken
 
     def _given(
-        self, signal: str, stamps: Array, times: Array, rows: Array | None, straight: bool
+        self,
+        signal: str,
+        stamps: Array,
+        times: Array,
+        kept: Mapping[Path, Any],
+        straight: bool,
     ) -> Array:
         """(T,) an input at all instants."""
         log = self.logs[signal]
-        values = self._values(log, signal, rows)
+        values = self._values(log, signal, kept)
         missing = np.flatnonzero(~np.isfinite(values))
         if missing.size:
-            row = int(missing[0]) + 2
+            row = int(kept[log.path][missing[0]]) + log.first
             raise InputError(
                 f"{log.path}, {log.rows} {row}, column {self.sources.signals[signal].column}: "
                 f"expected a number, found none; what was put in is known at every stamp"
@@ -243,24 +296,37 @@ class _Parts:
         held: Array = values[np.maximum(places, 0)]
         return held
 
-    def _stamps(self, log: Log, rows: Array | None) -> Array:
-        """(T,) the stamps of a file, in their unit."""
+    def _stamps(
+        self, log: Log, rows: Array | None
+    ) -> tuple[Array, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
+        """(T,) the stamps of a file, in their unit, and which of them do not repeat the one before.
+
+        Raises:
+            InputError: a stamp is missing or runs backwards, or many repeat the one before.
+        """
+        if self.sources.rate:
+            longest = max(len(values) for values in log.columns.values())
+            count = longest if rows is None else int(rows.sum())
+            return np.arange(count) / self.sources.rate, np.ones(count, dtype=bool)
         stamps = log.column(self.sources.time)
         stamps = stamps if rows is None else stamps[rows]
         where = f"{log.path}, column {self.sources.time}"
         if not np.isfinite(stamps).all():
-            row = int(np.flatnonzero(~np.isfinite(stamps))[0]) + 2
+            row = int(np.flatnonzero(~np.isfinite(stamps))[0]) + log.first
             raise InputError(f"{where}, {log.rows} {row}: expected a stamp, found none")
         if np.abs(stamps).max() * self.sources.second > LATEST:
             raise InputError(
                 f"{where}: expected stamps in the unit that [time] states, found {stamps[0]:.12g}; "
                 "is it milliseconds or less?"
             )
-        bad = np.flatnonzero(np.diff(stamps) <= 0)
+        steps = np.diff(stamps)
+        bad = np.flatnonzero(steps < 0)
+        if not bad.size and (steps == 0).sum() > MAX_REPEATED * stamps.size:
+            bad = np.flatnonzero(steps == 0)
         if bad.size:
-            row = int(bad[0]) + 3
+            row = int(bad[0]) + 1 + log.first
             raise InputError(
                 f"{where}, {log.rows} {row}: expected more than {stamps[bad[0]]:.12g}, found "
                 f"{stamps[bad[0] + 1]:.12g}; take out rows that came twice or late"
             )
-        return stamps
+        return np.asarray(stamps), np.asarray(np.diff(stamps, prepend=-np.inf) > 0)

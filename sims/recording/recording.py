@@ -127,8 +127,8 @@ class Recording:
     its runs.
 
     `extra` has the units of the columns that belong to no channel or input, such as pixels of a
-    tracked film; `model` the model file where it is of a robot; `notes` what is to be said of
-    how it was read, such as samples in which drives are off.
+    tracked film; `model` the model file where it is of a robot; `notes` say how its logs were read,
+    such as samples that were left out, or in which drives are off.
     """
 
     path: Path
@@ -200,7 +200,7 @@ def read_recording(
         kept,
         about.extra,
         model_in(description, meta),
-        switched.notes,
+        (*(note for part in parts for note in part.notes), *switched.notes),
     )
 
 

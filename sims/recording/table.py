@@ -32,12 +32,13 @@ _NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
 
 class TableRun(NamedTuple):
     """The rows of one run: its name, times (T,), and the other columns by name, each (T,); NaN
-    where missing.
+    where missing. `notes` say what was left out of its files.
     """
 
     name: str
     times: Array
     columns: dict[str, Array]
+    notes: tuple[str, ...] = ()
 
 
 def read_table(

@@ -6,7 +6,9 @@ from array import array
 import numpy as np
 import pytest
 
+import simgap
 from bench.cli import main
+from bench.recordings.inspection import load
 from sims.base import InputError
 from sims.recording import bags
 from sims.recording.logs import logs_in, read_log
@@ -198,3 +200,18 @@ def test_a_large_bag_is_read_message_by_message(tmp_path):
         tracemalloc.stop()
     np.testing.assert_array_equal(log.column("data"), np.arange(200.0))
     assert most < 10e6
+
+
+def test_a_stamp_that_repeats_does_not_drop_its_topic(tmp_path, monkeypatch):
+    twice = np.sort(np.append(TIMES, TIMES[50]))
+    monkeypatch.setattr("tests.sims.recording.test_bags.TIMES", twice)
+    written(tmp_path / "drive")
+    (tmp_path / "arm.xml").write_text(ARM)
+    out = tmp_path / "log.toml"
+    made = simgap.import_logs([tmp_path / "drive"], tmp_path / "arm.xml", out)
+    said = "\n".join(made.untold)
+    assert "joint_states: 1 of 201 stamps repeat the one before; their rows are left out" in said
+    assert "note: expected messages with numbers, found none; left out" in said
+    recording, _ = load(out, divide=False)
+    assert {"q.hip", "q.knee"} <= set(recording.runs[0].channels)
+    assert any("joint_states: 1 of 201 stamps repeat" in note for note in recording.notes)

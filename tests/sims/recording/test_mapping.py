@@ -92,7 +92,45 @@ def test_archives_and_parquet_hold_the_same(tmp_path):
     assert read_log(tmp_path / "sensors.npz").texts == ("name",)
 
 
+def test_the_scale_and_the_offset_of_a_signal_are_applied_before_its_unit(tmp_path):
+    # A gear of 1:5 that turns the sign, and the zero of an encoder, in the unit of the column.
+    toml = TOML.replace('unit = "mm"', 'unit = "mm"\nscale = -0.2\noffset = 1.5\nnoise = 2')
+    toml = toml.replace('unit = "N"', 'unit = "N"\nscale = 2\noffset = -1')
+    recording = read_recording(written(tmp_path, toml), Slider, whole=True)
+    x = recording.runs[0].channels["x"]
+    seen = np.array([0, 1.5, 4, 7, 9])
+    np.testing.assert_allclose(x[np.isfinite(x)], 1e-3 * (1.5 - 0.2 * seen), atol=1e-15)
+    assert recording.runs[0].inputs["u"].tolist() == [0, 0, 2, 2, 2, -5, -5]
+    # An offset does not change a noise.
+    assert recording.noise["x"] == pytest.approx(0.4e-3)
+
+
+def test_rows_at_a_rate_stand_for_stamps(tmp_path):
+    toml = TOML.replace('column = "stamp"\nunit = "ms"', "rate = 50")
+    (run,) = read_recording(written(tmp_path, toml), Slider, whole=True).runs
+    np.testing.assert_allclose(run.times, np.arange(5) / 50, atol=1e-15)
+    assert run.inputs["u"].tolist() == [0.5, 1.5, -2, 0, 0]
+
+
+def test_a_stamp_that_repeats_leaves_its_row_out_and_is_said(tmp_path):
+    rows = "".join(f'{100 + 10 * k},"[9, {k}]"\n' for k in range(40))
+    sensors = "stamp,pos\n" + rows.replace('120,"', '110,"[9, 77]"\n120,"')
+    recording = read_recording(written(tmp_path, sensors=sensors), Slider, whole=True)
+    x = recording.runs[0].channels["x"]
+    assert 0.077 not in x[np.isfinite(x)]
+    (note,) = recording.notes
+    assert note.endswith(
+        "sensors.csv: 1 of 41 stamps repeat the one before; their rows are left out"
+    )
+
+
 FAULTS = {
+    "a rate and stamps": ({"toml": TOML.replace("[time]", "[time]\nrate = 100")}, r"time: expected "
+                          r"a rate, or column and unit of stamps, found both"),
+    "no rate": ({"toml": TOML.replace('column = "stamp"\nunit = "ms"', "rate = 0")}, r"time.rate: "
+                r"expected a number of rows a second, more than 0, found 0"),
+    "many stamps twice": ({"commands": COMMANDS.replace("134", "112")}, r"row 4: expected more "
+                          r"than 112, found 112; take out rows that came twice"),
     "no such column": ({"toml": TOML.replace("Force", "Push")}, r"commands.csv: unknown column "
                        r"'Push'; there are: stamp, force"),
     "text": ({"toml": TOML.replace("Force", "note")}, r"'note': expected numbers, found text"),
@@ -111,8 +149,9 @@ FAULTS = {
                     r"more than 112, found 104"),
     "no unit of time": ({"toml": TOML.replace('"ms"', '"kg"')}, r"time.unit: "),
     "a word too many": ({"toml": TOML.replace("unit = \"ms", "units = \"ms")},
-                        r"'units'; there are: column, offset, unit"),
-    "not a table": ({"sensors": ""}, r"sensors.csv: not a table"),
+                        r"'units'; there are: column, offset, rate, unit"),
+    "not a table": ({"sensors": ""}, r"sensors.csv: expected a table with a header and rows, found"
+                    r" an empty file"),
 }  # fmt: skip
 
 

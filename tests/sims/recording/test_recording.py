@@ -178,7 +178,7 @@ def test_faulty_table_is_one_line_that_says_where(tmp_path, csv, message):
         ),
         (
             TOML.replace("noise", "nosie"),
-            r"unknown entry in \[channels.x\] of .*'nosie'; there are: column, file, noise, scale",
+            r"unknown entry in \[channels.x\] of .*'nosie'; there are: column, file, noise, offset",
         ),
         (
             TOML.replace("0.01", "0"),
@@ -217,7 +217,7 @@ def test_faulty_table_is_one_line_that_says_where(tmp_path, csv, message):
         ),
         (
             TOML + "[runs.b]\nheldout = true\n",
-            "'heldout'; there are: constants, drift, folder, held_out, initial, mass",
+            "'heldout'; there are: constants, drift, file, folder, held_out, initial, mass",
         ),
         (TOML.replace('system = "cart"', ""), 'expected system = "NAME", found None'),
         (TOML + "[oops]\n", "unknown entry of .*'oops'"),

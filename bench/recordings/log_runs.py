@@ -1,0 +1,104 @@
+"""Which of the logs that a user names are of which run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from sims.base import InputError
+from sims.recording.bags import ENDINGS, is_bag
+from sims.recording.hdf5 import is_hdf5, runs_in
+from sims.recording.lerobot import is_dataset
+from sims.recording.logs import logs_in, read_log
+
+TABLES = (".csv", ".tsv", ".npz", ".parquet", ".pt", ".pth", ".h5", ".hdf5", ".hdf")
+"""Endings of what is taken from a folder; other texts may be anything."""
+
+
+class RunFiles(NamedTuple):
+    """The logs of one run.
+
+    Attributes:
+        folder: the folder, or the bag, that they are in.
+        paths: of the logs.
+        alone: whether the run is one file among others of its folder that are runs, too.
+        chosen: whether the user named the files: then each of them has to be readable.
+    """
+
+    folder: Path
+    paths: list[Path]
+    alone: bool = False
+    chosen: bool = False
+
+    def name(self, path: Path) -> str:
+        """Return what a description calls a log."""
+        return path.relative_to(self.folder).as_posix()
+
+
+def runs_of(logs: Sequence[Path]) -> dict[str, RunFiles]:
+    """Return logs by run: those of each folder, bag or episode, or the files themselves.
+
+    Files of one folder are one run, unless all of them have the same columns: then each is a run.
+
+    Raises:
+        InputError: there is no log.
+    """
+    files = [path for path in logs if not path.is_dir() and not is_bag(path)]
+    runs: dict[str, RunFiles] = {}
+    for folder in (path for path in logs if path not in files):
+        if is_dataset(folder):
+            runs |= {path.parent.name: RunFiles(path.parent, [path]) for path in logs_in(folder)}
+            continue
+        inside = [folder] if is_bag(folder) else [folder, *sorted(folder.iterdir())]
+        for one in inside:
+            if is_bag(one):
+                own = list(logs_in(one))
+            elif one.is_dir():
+                own = [path for path in logs_in(one) if path.suffix.lower() in TABLES]
+            else:
+                continue
+            if own:
+                runs[one.stem if one.is_file() else one.name] = RunFiles(one, own)
+    if files and runs:
+        raise InputError("expected files of one run, or folders of one run each, found both")
+    if files:
+        folders = {path.parent for path in files}
+        if len(folders) > 1:
+            raise InputError("expected the files of one run in one folder; name the folders")
+        runs = {"": RunFiles(folders.pop(), files, chosen=True)}
+    if not runs:
+        given = ", ".join(map(str, logs))
+        kinds = ", ".join((*TABLES, *ENDINGS))
+        raise InputError(f"{given}: expected logs ({kinds}), found none")
+    if len(runs) == 1:
+        ((name, run),) = runs.items()
+        return _one_run_a_group(run) or _one_run_a_file(run) or {name: run}
+    return runs
+
+
+def _one_run_a_group(run: RunFiles) -> dict[str, RunFiles]:
+    """Return a run for each group of one HDF5 file that has one for each; nothing otherwise."""
+    if len(run.paths) != 1 or not is_hdf5(run.paths[0]):
+        return {}
+    groups = runs_in(run.paths[0])
+    if groups == run.paths:
+        return {}
+    return {group.name: RunFiles(run.folder, [group], True, run.chosen) for group in groups}
+
+
+def _one_run_a_file(run: RunFiles) -> dict[str, RunFiles]:
+    """Return a run for each file where all files have the same columns; nothing otherwise."""
+    tables = [path for path in run.paths if path.suffix.lower() in TABLES and path.is_file()]
+    stems = [path.stem for path in tables]
+    if len(tables) < 2 or len(tables) < len(run.paths) or len(set(stems)) < len(stems):
+        return {}
+    columns = []
+    for path in tables:
+        try:
+            columns.append(tuple(read_log(path).names()))
+        except InputError:  # said when the run is read
+            return {}
+    if len(set(columns)) > 1:
+        return {}
+    return {path.stem: RunFiles(run.folder, [path], True, run.chosen) for path in tables}

@@ -1,0 +1,164 @@
+"""Normalised positions of LeRobot, -100 to 100 of a joint's range (0 to 100 of a gripper's), which
+look like degrees: no number of a dataset tells the two apart, only a calibration file or its user.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.recordings.oddity import Oddity
+from sims.base import Array, InputError
+from sims.recording.lerobot import episode_of
+from sims.recording.lerobot_calibration import (
+    AngleScale,
+    MotorRange,
+    angle_scale,
+    find_calibration,
+    motor_of,
+    read_calibration,
+)
+from sims.recording.recording import Recording
+from sims.user_toml import read_toml
+
+if TYPE_CHECKING:  # a recording of no robot needs no model
+    from sims.robot.model import Joint
+
+LARGEST = 100.0 + 1e-3
+"""Largest magnitude of a normalised position, with the rounding of 32 bits."""
+REMEDY = (
+    "if they are normalised, import them with --calibration FILE (LeRobot keeps it in "
+    "~/.cache/huggingface/lerobot/calibration) or with --position-unit normalised (by the model's "
+    "ranges); if they are degrees, with --position-unit deg"
+)
+"""What to do about positions that may be normalised."""
+
+
+class NormalisedPositions:
+    """How the normalised positions of a log become angles.
+
+    Args:
+        motors: calibrated ranges by motor; empty where only the model's ranges are known.
+        source: the calibration file; None where there is none.
+    """
+
+    def __init__(self, motors: Mapping[str, MotorRange], source: Path | None) -> None:
+        self.motors = motors
+        self.source = source
+
+    def scale_of(self, column: str, values: Array, joint: Joint) -> tuple[str, AngleScale] | None:
+        """Return the unit of a column's positions, and how they become it; None where neither a
+        calibration nor the model says the range of the joint.
+
+        Args:
+            column: its name.
+            values: (T,) its numbers.
+            joint: that it is of.
+        """
+        from_zero = "gripper" in column.lower() and float(np.nanmin(values)) >= 0.0
+        motor = motor_of(column, self.motors)
+        # Counts of a slide's motor are no metres: its range is the model's.
+        if motor is not None and joint.kind == "hinge":
+            return "deg", angle_scale(self.motors[motor], from_zero)
+        if joint.range is None:
+            return None
+        low, high = joint.range
+        if from_zero:
+            return joint.unit, AngleScale((high - low) / 100.0, low)
+        return joint.unit, AngleScale((high - low) / 200.0, (high + low) / 2.0)
+
+    def says(self) -> str:
+        """Return by what the positions become angles."""
+        if self.source is None:
+            return (
+                "normalised, -100 to 100 (a gripper's 0 to 100) of the joints' ranges in the model"
+            )
+        return (
+            "normalised, -100 to 100 (a gripper's 0 to 100) of the ranges in "
+            f"{self.source.name}, zero in the middle of each"
+        )
+
+
+def normalised_positions(
+    log: Path, largest: float, stated: str, calibration: Path | None
+) -> NormalisedPositions | None:
+    """Return how positions become angles; None where they are to be taken for angles.
+
+    Args:
+        log: that holds them.
+        largest: magnitude among them.
+        stated: unit that the user states; empty where none is stated.
+        calibration: file that the user names; None to look for one in the dataset and beside it.
+
+    Raises:
+        InputError: they are said to be normalised and are not, or the file cannot be read.
+    """
+    within = largest <= LARGEST
+    asked = stated == "normalised" or calibration is not None
+    if asked and not within:
+        raise InputError(
+            f"{log}: expected normalised positions within -100 to 100, found {largest:.4g}; leave "
+            "out --calibration and --position-unit normalised"
+        )
+    if calibration is None and within and not stated:
+        episode = episode_of(log)
+        folders = _folders(episode[0]) if episode else []
+        calibration = find_calibration(folders)
+        asked = calibration is not None
+    if not asked:
+        return None
+    motors = read_calibration(calibration) if calibration is not None else {}
+    return NormalisedPositions(motors, calibration)
+
+
+def is_lerobot(log: Path, columns: Iterable[str]) -> bool:
+    """Return whether a log is one of LeRobot: an episode, or a table with its names."""
+    names = ("observation.state", "observation/state")
+    return episode_of(log) is not None or any(column.startswith(names) for column in columns)
+
+
+def may_be_normalised(recording: Recording) -> Iterator[Oddity]:
+    """Yield the oddity of a LeRobot dataset whose positions are taken for degrees and lie within
+    -100 to 100; a channel that states its `scale` is not doubted.
+    """
+    description = recording.path.with_suffix(".toml")
+    if not description.is_file():
+        return
+    meta = read_toml(description)
+    channels = meta.get("channels")
+    if not isinstance(channels, dict) or not _episodes(description, meta):
+        return
+    degrees = [
+        name
+        for name, own in channels.items()
+        if isinstance(own, dict) and str(own.get("unit", "")).startswith("deg")
+        and "scale" not in own and name.startswith("q.")
+    ]  # fmt: skip
+    values = [run.channels[name] for run in recording.runs for name in degrees
+              if name in run.channels]  # fmt: skip
+    largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in values), default=np.inf)
+    if np.degrees(largest) <= LARGEST:
+        yield Oddity(
+            "positions of a LeRobot dataset are taken for degrees and lie within -100 to 100, as "
+            f"normalised ones do; {REMEDY} (scale = 1 in the description)",
+            False,
+        )
+
+
+def _episodes(description: Path, meta: Mapping[str, object]) -> bool:
+    """Whether a description's runs are episodes of a dataset."""
+    runs = meta.get("runs")
+    folders = [own.get("folder") for own in runs.values() if isinstance(own, dict)] if isinstance(
+        runs, dict) else []  # fmt: skip
+    return any(
+        isinstance(folder, str) and episode_of(description.parent / folder / "frames") is not None
+        for folder in folders[:1]
+    )
+
+
+def _folders(dataset: Path) -> Sequence[Path]:
+    """Where the calibration of a dataset may lie."""
+    return [dataset, dataset / "meta", dataset / "calibration", dataset.parent]

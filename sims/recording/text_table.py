@@ -1,0 +1,346 @@
+"""Tables of text as loggers and spreadsheets write them: numbers by the names of their columns.
+
+Decimal commas are read where the separator, or the cells themselves, leave no doubt; a cell that is
+not what its column holds is refused with its row.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sims.base import Array, InputError, frozen
+from sims.recording.columnar import WIDEST
+from sims.recording.named_entries import entries_by_name, lists_by_name
+from sims.recording.table_layout import (
+    COMMENT,
+    INSTANT,
+    NO_NUMBER,
+    NUMBER,
+    NUMBERS,
+    Layout,
+    find_layout,
+    is_numeric,
+)
+from sims.user_toml import shown
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """The columns of a table of text.
+
+    Attributes:
+        columns: numbers by name, (T,) or (T, k), NaN where missing.
+        texts: names of the columns that hold none.
+        units: by column, where a row of the table states them.
+        unlisted: columns that another one holds under the name of its joint.
+        named: whether the file names its columns.
+        first: line of the first row of data, counted from 1.
+    """
+
+    columns: Mapping[str, Array]
+    texts: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    unlisted: frozenset[str] = frozenset()
+    named: bool = True
+    first: int = 2
+
+
+def read_text_table(path: Path) -> TextTable:
+    """Read a table of text of any layout.
+
+    Raises:
+        InputError: it is not a table, or a cell is not what its column holds; in one line that
+            says the row.
+    """
+    layout = find_layout(path)
+    cells = _cells(path, layout)
+    columns: dict[str, Array] = {}
+    texts: dict[str, list[str]] = {}
+    kinds = [_CellKind(column, layout.separator) for column in cells]
+    # One column may leave open what another one shows: `1,234` is 1.234 in a file that has `0,5`.
+    commas = any(kind.has_decimal_commas for kind in kinds)
+    for name, kind in zip(_names(layout), kinds, strict=True):
+        values = kind.numbers(path, layout, name, commas)
+        if values is None:
+            texts[name] = kind.texts.tolist()
+        else:
+            columns[name] = frozen(values)
+    named, unlisted = entries_by_name(columns, texts)
+    listed, replaced = lists_by_name(columns, texts)
+    return TextTable(
+        {**columns, **named, **listed},
+        tuple(texts),
+        layout.units,
+        unlisted | replaced,
+        bool(layout.names),
+        layout.first,
+    )
+
+
+def _names(layout: Layout) -> list[str]:
+    """A different name for each column, as pandas makes them: ``q``, ``q.1``, ``Unnamed: 3``."""
+    names = layout.names or tuple(f"column {place + 1}" for place in range(layout.width))
+    result: list[str] = []
+    for place, name in enumerate(names):
+        own = name or f"Unnamed: {place}"
+        number = 1
+        while own in result:
+            own, number = f"{name}.{number}", number + 1
+        result.append(own)
+    return result
+
+
+def _cells(path: Path, layout: Layout) -> list[Any]:
+    """The cells of each column, texts."""
+    import pandas
+
+    separator = r"\s+" if layout.separator == " " else layout.separator
+    for encoding in (layout.encoding, "cp1252"):
+        try:
+            with path.open(encoding=encoding, newline="") as file:
+                # A quotation mark in a note above must not swallow the rows.
+                for _ in range(layout.first - 1):
+                    next(file, "")
+                table = pandas.read_csv(
+                    file,
+                    sep=separator,
+                    header=None,
+                    dtype=str,
+                    keep_default_na=False,
+                    skipinitialspace=True,
+                )
+            break
+        except UnicodeDecodeError:  # beyond the first bytes
+            continue
+        except pandas.errors.EmptyDataError:
+            return [np.array([], dtype=object)] * layout.width
+        except (pandas.errors.ParserError, ValueError) as error:
+            raise _uneven(path, layout) or _not_a_table(path, layout, error) from None
+    else:
+        raise InputError(f"{path}: expected UTF-8 text; save it as UTF-8")
+    comment = table[0].str.match(COMMENT.pattern)
+    if comment.any():
+        table = table[~comment.to_numpy(dtype=bool)]
+    # The reader fills rows that are too short.
+    if (table[table.columns[-1]].fillna("") == "").any() and (fault := _uneven(path, layout)):
+        raise fault
+    while table.shape[1] > layout.width and (table[table.columns[-1]].fillna("") == "").all():
+        table = table.iloc[:, :-1]
+    if table.shape[1] > WIDEST:
+        raise InputError(f"{path}: expected at most {WIDEST} columns, found {table.shape[1]}")
+    if table.shape[1] != layout.width:
+        raise InputError(
+            f"{path}, row {layout.first}: expected {layout.width} cells, found {table.shape[1]}"
+        )
+    return [table[name].fillna("").to_numpy(dtype=object) for name in table.columns]
+
+
+def _not_a_table(path: Path, layout: Layout, error: Exception) -> InputError:
+    """What to say of a file whose rows the reader cannot tell apart."""
+    opened = re.search(r"EOF inside string starting at row (\d+)", str(error))
+    if opened:
+        row = layout.first + int(opened[1])
+        return InputError(
+            f"{path}, row {row}: a quotation mark opens a cell and none closes it; close or "
+            "delete it"
+        )
+    return InputError(
+        f"{path}, row {layout.first}: expected rows of {layout.width} cells between commas, "
+        "semicolons, tabs or blanks; save the file as CSV"
+    )
+
+
+def _uneven(path: Path, layout: Layout) -> InputError | None:
+    """What to say of the first row with another number of cells; None where all are even."""
+    line = layout.first
+    try:
+        for line, last, row in _rows(path, layout):
+            filled = len(row)
+            while filled > layout.width and not row[filled - 1].strip():
+                filled -= 1
+            if filled == layout.width:
+                continue
+            if last > line:
+                return InputError(
+                    f"{path}, row {line}: a quotation mark opens a cell that ends in row {last}; "
+                    "close or delete it"
+                )
+            where = f"as in the header, row {layout.header}" if layout.header else "as above"
+            remedy = "correct or delete this row"
+            if filled < layout.width and line >= _last_line(path, layout):
+                remedy = "the log was cut off there: delete this row"
+            return InputError(
+                f"{path}, row {line}: expected {layout.width} cells {where}, found {filled}; "
+                f"{remedy}"
+            )
+    except csv.Error:  # such as a cell of more than 131,072 characters
+        return InputError(
+            f"{path}, row {line + 1}: expected cells of numbers or short texts, found a cell that "
+            "is too long; is a quotation mark not closed?"
+        )
+    return None
+
+
+def _rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
+    """The rows of data with their first and last lines, comments and blank lines left out."""
+    with path.open(encoding=layout.encoding, errors="replace", newline="") as file:
+        if layout.separator == " ":
+            for line, text in enumerate(file, start=1):
+                if line >= layout.first and text.strip() and not COMMENT.match(text):
+                    yield line, line, text.split()
+            return
+        for _ in range(layout.first - 1):
+            next(file, "")
+        reader = csv.reader(file, delimiter=layout.separator, skipinitialspace=True)
+        before = layout.first - 1
+        for row in reader:
+            last = layout.first - 1 + reader.line_num
+            if any(row) and not COMMENT.match(row[0]):
+                yield before + 1, last, row
+            before = last
+
+
+def _last_line(path: Path, layout: Layout) -> int:
+    """The line of the last row of data."""
+    last = 0
+    for line, *_ in _rows(path, layout):
+        last = line
+    return last
+
+
+def _line_of(path: Path, layout: Layout, record: int) -> int:
+    """The line of a row of data, counted from 1 as an editor shows it."""
+    for number, (line, *_) in enumerate(_rows(path, layout)):
+        if number == record:
+            return line
+    return layout.first + record
+
+
+MAX_SAMPLED_CELLS = 1000
+"""Maximum number of cells of a column by which text is told from numbers with commas."""
+
+
+class _CellKind:
+    """The cells of one column, and what kind of numbers they hold."""
+
+    def __init__(self, cells: Any, separator: str) -> None:
+        import pandas
+
+        self.cells = cells
+        self.series = pandas.Series(cells, dtype=object).astype(str).str.strip()
+        self.texts = self.series.to_numpy(dtype=object)
+        self.filled = self.series[self.series != ""]
+        self.has_commas, self.has_decimal_commas, self.is_thousands = False, False, False
+        commas = self.filled[self.filled.str.contains(",", regex=False)]
+        some = commas.iloc[:: max(len(commas) // MAX_SAMPLED_CELLS, 1)]
+        # A list has commas, too, and a text may have.
+        if commas.empty or 2 * sum(map(bool, map(NUMBER.fullmatch, some))) < len(some):
+            return
+        self.has_commas = True
+        several = (commas.str.count(",") > 1) | commas.str.contains(r",.*\.", regex=True)
+        self.is_thousands = bool(several.any())
+        if separator != ",":
+            self.has_decimal_commas = not self.is_thousands
+        else:
+            # Three digits behind a comma may be thousands, unless other cells say what they are.
+            groups = commas.str.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?")
+            self.has_decimal_commas = not bool(groups.all()) and not self.is_thousands
+
+    def numbers(self, path: Path, layout: Layout, name: str, commas: bool) -> Array | None:
+        """(T,) or (T, k) numbers; None where the column holds text."""
+        import pandas
+
+        if self.filled.empty:
+            return np.full(len(self.series), np.nan)
+        first = self.filled.iloc[0]
+        if NUMBERS.fullmatch(first) and is_numeric(first):
+            return self._lists(path, layout, name)
+        if INSTANT.fullmatch(first):
+            return self._instants(path, layout, name)
+        texts = self.series
+        if self.has_commas:
+            if self.has_decimal_commas or (commas and not self.is_thousands):
+                texts = self._decimal_points(path, layout, name)
+            elif self.is_thousands:
+                texts = texts.str.replace(",", "", regex=False)
+            else:
+                row = int(np.flatnonzero(texts.str.contains(",", regex=False))[0])
+                raise self._fault(
+                    path, layout, name, row, "a number with a decimal point",
+                    "; its comma may divide decimals or thousands",
+                )  # fmt: skip
+        values = pandas.to_numeric(texts.where(texts != "", "nan"), errors="coerce")
+        result = np.asarray(values, dtype=np.float64)
+        known = (texts == "") | texts.str.lower().isin(NO_NUMBER)
+        bad = np.flatnonzero(np.isnan(result) & ~known.to_numpy(dtype=bool))
+        if bad.size == 0:
+            return result
+        if bad.size > 0.5 * len(self.filled):
+            return None
+        raise self._fault(path, layout, name, int(bad[0]), "a number")
+
+    def _decimal_points(self, path: Path, layout: Layout, name: str) -> Any:
+        """The cells with decimal points in place of decimal commas."""
+        grouped = self.filled.str.fullmatch(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?")
+        if self.filled.str.contains(r"\..*,", regex=True).any():
+            texts = self.series.str.replace(r"\.(?=\d{3}(\D|$))", "", regex=True)
+        else:
+            points = self.filled.str.contains(".", regex=False)
+            if points.any():
+                # 1.234 is a thousand in one of the two ways to write, and one in the other.
+                row = int(points.index.to_numpy()[points.to_numpy().argmax()])
+                more = "; other cells of this column have decimal commas"
+                if not grouped[points].all():
+                    raise self._fault(path, layout, name, row, "a decimal comma", more)
+                raise self._fault(path, layout, name, row, "a number without a point", more)
+            texts = self.series
+        return texts.str.replace(",", ".", n=1, regex=False)
+
+    def _instants(self, path: Path, layout: Layout, name: str) -> Array | None:
+        """(T,) seconds since 1970 of instants such as ``2026-11-26 17:24:01.123``."""
+        import pandas
+
+        empty = (self.series == "").to_numpy(dtype=bool)
+        texts = self.series.str.replace(",", ".", regex=False).str.replace("UTC", "Z", regex=False)
+        known = self.series.str.fullmatch(INSTANT.pattern).to_numpy(dtype=bool) | empty
+        if not known.all():
+            row = int(np.flatnonzero(~known)[0])
+            raise self._fault(path, layout, name, row, f"an instant as {self.filled.iloc[0]}")
+        stamps = pandas.to_datetime(
+            texts.where(texts != "", None), utc=True, format="ISO8601", errors="coerce"
+        )
+        whole = stamps.astype("datetime64[ns, UTC]").astype("int64").to_numpy(dtype=np.int64)
+        return np.where(stamps.isna().to_numpy(), np.nan, whole * 1e-9)
+
+    def _lists(self, path: Path, layout: Layout, name: str) -> Array:
+        """(T, k) of cells such as ``[0.1, 0.2]``."""
+        rows: list[list[float]] = []
+        for number, text in enumerate(self.texts):
+            match = NUMBERS.fullmatch(text)
+            try:
+                inside = match["inside"].replace(",", " ").split() if match else None
+                row = [float(part) for part in inside] if inside is not None else None
+            except ValueError:
+                row = None
+            if row is None or (rows and len(row) != len(rows[0])) or len(row) > WIDEST:
+                wanted = f"a list of {len(rows[0])} numbers" if rows else "a list of numbers"
+                raise self._fault(path, layout, name, number, wanted)
+            rows.append(row)
+        return np.array(rows, dtype=np.float64).reshape(len(rows), -1)
+
+    def _fault(
+        self, path: Path, layout: Layout, name: str, record: int, wanted: str, more: str = ""
+    ) -> InputError:
+        """What to say of a cell that is not what its column holds."""
+        line = _line_of(path, layout, record)
+        found = shown(self.cells[record])
+        return InputError(
+            f"{path}, row {line}, column {name}: expected {wanted}, found {found}{more}"
+        )
