@@ -5,7 +5,7 @@ known of each run.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -82,6 +82,7 @@ class Description:
             a run begins as their first cells say.
         linear: inputs that go straight from one sample to the next.
         sources: where the columns stand.
+        wrapped: angles whose whole turns are restored, each with the input that tells the turn.
         switches: columns that say when drives are on.
     """
 
@@ -97,6 +98,7 @@ class Description:
     linear: frozenset[str]
     sources: Sources
     switches: tuple[DriveSwitch, ...] = ()
+    wrapped: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -280,7 +282,33 @@ def check_description(path: Path, meta: Mapping[str, Any], declared: Declared) -
         linear=frozenset(name for name, column in inputs.items() if _hold(path, name, column)),
         sources=sources,
         switches=switches,
+        wrapped=_wrapped(path, channels, inputs, declared),
     )
+
+
+def _wrapped(
+    path: Path,
+    channels: Mapping[str, _Column],
+    inputs: Mapping[str, _Column],
+    declared: Declared,
+) -> dict[str, str]:
+    """Return the channels whose whole turns are restored, each with the input that tells the turn,
+    or an empty name.
+    """
+    units = {channel.name: channel.unit for channel in declared.channels}
+    result = {}
+    for name, column in channels.items():
+        value = column.table.get("unwrap", False)
+        where = f"channels.{name}.unwrap"
+        if not isinstance(value, (bool, str)):
+            raise fault(path, where, "true, or the name of the command that tells the turn", value)
+        if isinstance(value, str):
+            known(f"{where} of {path}", [value], inputs)
+        if value and units[name] != "rad":
+            raise fault(path, where, f"it with an angle alone ({name} is in {units[name]})", value)
+        if value:
+            result[name] = value if isinstance(value, str) else ""
+    return result
 
 
 def _switches(
@@ -379,7 +407,7 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
         "offset",
         "column",
         "file",
-        "noise" if kind == "channel" else "hold",
+        *(("noise", "unwrap") if kind == "channel" else ("hold",)),
     )
     _known(path, f"{kind}s.{name}", own, allowed)
     # No unit is no SI unit: a log in degrees without a word of it would be read as radians.

@@ -46,6 +46,8 @@ class Sources:
         stated: whether any of it is said: else the table is one that was written for simgap.
         rate: Hz, rows in place of stamps; 0 where the logs have stamps.
         files: by run, the file of the signals that state none, as seen from the run's folder.
+        is_renaming: whether columns alone are stated, so that the table may be one that was written
+            for simgap, with other names.
     """
 
     signals: Mapping[str, Source]
@@ -56,6 +58,7 @@ class Sources:
     stated: bool = False
     rate: float = 0.0
     files: Mapping[str, str] = field(default_factory=dict)
+    is_renaming: bool = False
 
 
 def read_sources(
@@ -95,15 +98,18 @@ def read_sources(
         if "folder" in marks:
             folders[name] = text(path, f"runs.{name}.folder", marks["folder"])
     said = any({"file", "column"} & own.keys() for own in columns.values())
+    elsewhere = any("file" in own for own in columns.values()) or bool(folders)
+    elsewhere = elsewhere or bool({"column", "unit", "rate"} & time.keys())
     return Sources(
         signals,
         stamps,
         second,
         finite(path, "time.offset", time.get("offset", 0.0)),
         folders,
-        bool(said or folders or {"column", "unit", "rate"} & time.keys()),
+        said or elsewhere,
         rate,
         own_files,
+        said and not elsewhere,
     )
 
 

@@ -30,8 +30,9 @@ from sims.recording.description import (
 )
 from sims.recording.drive_switches import switched_runs
 from sims.recording.frame import Frame, described, read_frame, with_index
-from sims.recording.mapping import read_logs
-from sims.recording.table import TableRun, read_table
+from sims.recording.mapping import Sources, read_logs
+from sims.recording.table import TableRun, has_run_column, read_table
+from sims.recording.turns import unwrapped
 from sims.recording.units import SAME, Scale
 
 __all__ = ["Declared", "Recording", "Run", "read_recording", "system_of"]
@@ -183,11 +184,15 @@ def read_recording(
     description, meta = read_meta(table)
     about = check_description(description, meta, declared)
     columns = list(about.channels), list(about.inputs)
-    if about.sources.stated:
+    own = table.with_suffix(".csv") if table.suffix == ".toml" else table
+    if about.sources.is_renaming and has_run_column(own):
+        table = own
+        parts = _read_renamed(own, about.sources, *columns, list(about.extra))
+    elif about.sources.stated:
         parts = read_logs(table.with_suffix(".csv"), about.sources, *columns, about.linear)
     else:
-        table = table.with_suffix(".csv") if table.suffix == ".toml" else table
-        parts = read_table(table, *columns, list(about.extra))
+        table = own
+        parts = read_table(own, *columns, list(about.extra))
     check_names(description, about.runs, [part.name for part in parts])
     switched = switched_runs(table, [_run(table, part, about) for part in parts], about.switches)
     kept = switched.runs if whole else _split(description, switched.runs, folds)
@@ -202,6 +207,24 @@ def read_recording(
         model_in(description, meta),
         (*(note for part in parts for note in part.notes), *switched.notes),
     )
+
+
+def _read_renamed(
+    path: Path,
+    sources: Sources,
+    channels: Sequence[str],
+    inputs: Sequence[str],
+    extra: Sequence[str],
+) -> list[TableRun]:
+    """Read a table whose columns have other names than the signals, as the description says."""
+    columns = {name: sources.signals[name].column for name in (*channels, *inputs)}
+    parts = []
+    recorded = [columns[name] for name in channels], [columns[name] for name in inputs]
+    for part in read_table(path, recorded[0], recorded[1], extra):
+        values = {name: part.columns[column] for name, column in columns.items()}
+        values |= {name: part.columns[name] for name in extra}
+        parts.append(part._replace(columns=values))
+    return parts
 
 
 def recording_of_frame(
@@ -275,6 +298,8 @@ def _run(table: Path, part: TableRun, about: Description) -> Run:
     marks = about.runs.get(part.name, _UNMARKED)
     channels = {n: _converted(table, part, n, s) for n, s in about.channels.items()}
     inputs = {n: _converted(table, part, n, s) for n, s in about.inputs.items()}
+    for name, command in about.wrapped.items():
+        channels[name] = frozen(unwrapped(channels[name], inputs.get(command)))
     # no system reads them, so they keep their unit; of logs nobody has asked for any
     extra = {name: part.columns[name] for name in about.extra if name in part.columns}
     first = {n: s.gain * extra[n][0] + s.offset for n, s in about.begins.items() if n in extra}

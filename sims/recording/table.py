@@ -59,6 +59,15 @@ def read_table(
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
+def has_run_column(path: Path) -> bool:
+    """Return whether the header of a table has the column `run`, as tables of simgap have."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            return "run" in file.readline().strip().split(",")
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
 def _not_text(path: Path) -> InputError:
     """What is wrong with a table that is no UTF-8."""
     data = path.read_bytes()

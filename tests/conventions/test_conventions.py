@@ -10,10 +10,11 @@ import pytest
 from bench.cli import main
 from bench.gap.conventions.comparison import ConventionComparison, Difference
 from bench.gap.conventions.corrected_description import corrected, lines_of
-from bench.gap.conventions.hypotheses import Change, Hypothesis, unwrapped
+from bench.gap.conventions.hypotheses import Change, Hypothesis
 from bench.gap.unit_check import Subject
 from bench.recordings.inspection import load
 from sims.recording.description import read_meta
+from sims.recording.turns import unwrapped
 from tests.conventions.logs import BROKEN, CAUSES, write_log
 
 SEEDS = {
@@ -67,12 +68,24 @@ def test_a_cause_is_no_broken_convention(cause, tmp_path):
     assert check(log.path).differences() == []
 
 
-def test_the_check_can_fail(tmp_path, monkeypatch):
-    """Without what causes gain, a servo whose gains are wrong passes for late commands."""
-    log = write_log(tmp_path / "log", 1007, None, "stiffness")
-    monkeypatch.setattr("bench.gap.conventions.comparison.LOG_LIKELIHOOD_MARGIN", -1e9)
-    monkeypatch.setattr(ConventionComparison, "_gain_of_causes", lambda *_: 0.0)
+def test_a_change_that_transforms_nothing_finds_nothing(tmp_path, monkeypatch):
+    log = write_log(tmp_path / "log", *_seed("sign of command"))
     assert check(log.path).differences() != []
+    monkeypatch.setattr(Change, "applied", lambda change, signals: signals[change.source])
+    assert check(log.path).differences() == []
+
+
+def test_soft_friction_is_no_other_zero(tmp_path):
+    """A rod that gravity turns, with friction in MuJoCo's soft form: another zero gains something,
+    and less than friction does.
+    """
+    log = write_log(tmp_path / "log", 2002, None, "friction")
+    comparison = check(log.path)
+    assert comparison.differences() == []
+
+
+def _seed(broken):
+    return SEEDS[broken][0], broken
 
 
 def test_whole_turns_are_put_back_beside_the_command():

@@ -33,18 +33,21 @@ from bench.gap.conventions.hypotheses import (
     HypothesisGenerator,
     Joint,
 )
+from bench.gap.friction_form import has_soft_form, soft_kind
 from bench.gap.identify import listed
-from bench.gap.model.bounds import coefficient_bounds
+from bench.gap.model.bounds import clip_coefficients
 from bench.gap.model.floor import noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.problem import Fit
 from bench.gap.model.world import World
 from bench.gap.prediction_error.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
 from bench.gap.prediction_error.identification import identify
-from bench.gap.prediction_error.joint_effects import MANY_SHAPES
+from bench.gap.prediction_error.joint_effects import MANY_SHAPES, joint_name
+from bench.gap.prediction_error.model_filters import SOFT_FACTORS
 from bench.gap.unit_check import Subject
 from sims.base import Array
 from sims.recording.recording import Recording, Run
+from sims.robot.simulator import RobotSimulator
 
 LOG_LIKELIHOOD_MARGIN = 20.0
 """Log likelihood by which a hypothesis must exceed the log as it is described."""
@@ -260,6 +263,7 @@ class ConventionComparison:
                 theta[world.slots[one.effect]] = _coefficients(world, probes, one, numbers)
             after = followed.with_parameters(theta).log_likelihood
             gain = max(gain, after - before - penalty)
+        gain = max(gain, _log_likelihood_of_soft_friction(followed) - before)
         world.close()
         if not self._suspects(self._follow(self._parts(corrected))):
             return gain
@@ -307,9 +311,28 @@ def _coefficients(world: World, probes: Sequence[Probe], group: Group, numbers: 
     for column, value in zip(group.columns, numbers, strict=True):
         if not probes[column].fixed:
             c[probes[column].place] = value
-    lower, upper = np.array(coefficient_bounds(world, group.effect)).T
-    limited: Array = np.clip(c, lower, upper)
-    return limited
+    return clip_coefficients(world, group.effect, c)
+
+
+def _log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
+    """Return the largest log likelihood with dry friction in MuJoCo's soft form at the joint where
+    most force is missing, which a regression does not contain; minus infinity without such an
+    effect.
+    """
+    world, joint = followed.world, followed.joints_by_loss[0]
+    name = f"friction.coulomb@{joint_name(world, joint)}"
+    if name not in world.library or has_soft_form(world):
+        return -np.inf
+    simulator = world.simulator_of(soft_kind(world.kind))
+    assert isinstance(simulator, RobotSimulator)
+    likelihoods = []
+    for factor in SOFT_FACTORS:
+        theta = world.nominal()
+        limit = np.array([factor * float(followed.force[joint])])
+        theta[world.slots[name]] = clip_coefficients(world, name, limit)
+        likelihoods.append(followed.with_parameters(theta, simulator).log_likelihood)
+    simulator.close()
+    return max(likelihoods)
 
 
 def _liveliest_part(run: Run) -> slice:

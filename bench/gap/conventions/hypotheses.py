@@ -19,6 +19,7 @@ from bench.gap.identify import listed
 from bench.gap.unit_check import UNITS, UNITS_IN_WORDS, Signal, Subject
 from sims.base import Array
 from sims.recording.recording import Recording, Run
+from sims.recording.turns import unwrapped
 
 ANGLES = np.array([-120.0, -70.0, -35.0, -15.0, 15.0, 35.0, 70.0, 120.0, 180.0]) * math.pi / 180.0
 """Offsets of a zero position that are tried, rad; the best one is refined."""
@@ -150,22 +151,6 @@ class Joint:
     servo_inputs: tuple[str, ...]
     range: tuple[float, float] | None
     is_hinge: bool
-
-
-def unwrapped(positions: Array, command: Array | None = None) -> Array:
-    """Restore the whole turns of a wrapped position; NaN stays.
-
-    Args:
-        positions: (T,) in rad.
-        command: (T,) of the joint's position servo, which tells the turn.
-    """
-    result = positions.copy()
-    finite = np.isfinite(positions)
-    result[finite] = np.unwrap(positions[finite])
-    if command is not None and finite.any():
-        difference = float(np.mean((command - result)[finite]))
-        result += 2.0 * math.pi * round(difference / (2.0 * math.pi))
-    return result
 
 
 def recorded_joints(subject: Subject) -> list[Joint]:
