@@ -97,7 +97,7 @@ def _matches(log, hypothesis):
     words = {
         "sign of position": "the sign of q.",
         "sign of command": "the sign of u.",
-        "sign of both": "counted the other way round",
+        "sign of both": "the axis of joint",
         "zero of position": "position q.",
         "zero of both": "counted from another zero",
         "unit of one": "look like",

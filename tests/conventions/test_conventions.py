@@ -20,7 +20,7 @@ from tests.conventions.logs import BROKEN, CAUSES, write_log
 SEEDS = {
     "sign of position": (12, "the sign of q.j1, qd.j1 looks reversed"),
     "sign of command": (1, "the sign of u.m1 looks reversed"),
-    "sign of both": (14, "joint j0 looks counted the other way round, command and position"),
+    "sign of both": (14, "the axis of joint j0 looks reversed, command and position"),
     "zero of position": (15, "position q.j1 looks counted from another zero"),
     "zero of both": (40, "joint j1 looks counted from another zero, command and position"),
     "unit of one": (5, "the numbers of q.j2 look like degrees, stated as radians"),

@@ -256,7 +256,7 @@ def _signs(joint: Joint) -> Iterator[Hypothesis]:
             yield Hypothesis(text, {name: Change(name, -1.0) for name in names})
     if positions and joint.inputs:
         names = [*joint.channels.values(), *joint.inputs]
-        text = f"joint {joint.name} looks counted the other way round, command and position"
+        text = f"the axis of joint {joint.name} looks reversed, command and position"
         yield Hypothesis(text, {name: Change(name, -1.0) for name in names})
 
 

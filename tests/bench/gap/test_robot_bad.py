@@ -148,8 +148,13 @@ def test_a_log_of_something_else_is_one_line(name, tmp_path):
 
 
 @pytest.mark.slow
-def test_commands_in_degrees_are_answered_with_the_unit(tmp_path):
-    explained = explain(table_of(tmp_path, scaled(57.3, 1, 1, 1)))
+def test_commands_in_degrees_are_refused_with_the_unit_and_found_again_if_the_user_insists(
+    tmp_path,
+):
+    path = table_of(tmp_path, scaled(57.3, 1, 1, 1))
+    with pytest.raises(InputError, match=r'u\.m_shoulder look like degrees.* unit = "deg"'):
+        explain(path)
+    explained = explain(path, force=True)
     assert explained.causes == ()
     (fault,) = explained.answer.recording_faults
     assert fault.signals == ("u.m_shoulder",)
@@ -158,15 +163,20 @@ def test_commands_in_degrees_are_answered_with_the_unit(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_encoder_that_is_a_quarter_turn_off_is_named_with_its_place(tmp_path):
-    explained = explain(table_of(tmp_path, lambda v: v + np.array([0, 0, 0, 1.57])))
-    (cause,) = explained.causes
+def test_an_encoder_that_is_a_quarter_turn_off_is_refused_and_named_if_the_user_insists(tmp_path):
+    path = table_of(tmp_path, lambda v: v + np.array([0, 0, 0, 1.57]))
+    with pytest.raises(InputError, match=r"q\.elbow looks counted from another zero"):
+        explain(path)
+    (cause,) = explain(path, force=True).causes
     assert cause.effect == "sensor.bias@q.elbow"
     assert cause.coefficients["coefficient"].value == pytest.approx(1.57, abs=5e-3)
 
 
 @pytest.mark.slow
-def test_swapped_joints_have_no_cause_that_would_explain_them(tmp_path):
-    explained = explain(table_of(tmp_path, lambda v: v[:, [0, 1, 3, 2]]))
+def test_swapped_joints_are_refused_and_have_no_cause_that_would_explain_them(tmp_path):
+    path = table_of(tmp_path, lambda v: v[:, [0, 1, 3, 2]])
+    with pytest.raises(InputError, match="channels of shoulder, elbow look exchanged"):
+        explain(path)
+    explained = explain(path, force=True)
     assert explained.answer.verdict in ("unknown", "partial")
     assert [c.effect for c in explained.causes if not c.effect.startswith("numerics.")] == []
