@@ -35,7 +35,7 @@ from bench.gap.conventions.hypotheses import (
 )
 from bench.gap.friction_form import has_soft_form, soft_kind
 from bench.gap.identify import listed
-from bench.gap.model.bounds import clip_coefficients
+from bench.gap.model.bounds import clip_coefficients, coefficient_bounds
 from bench.gap.model.floor import noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.problem import Fit
@@ -43,7 +43,8 @@ from bench.gap.model.world import World
 from bench.gap.prediction_error.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
 from bench.gap.prediction_error.identification import identify
 from bench.gap.prediction_error.joint_effects import MANY_SHAPES, joint_name
-from bench.gap.prediction_error.model_filters import SOFT_FACTORS
+from bench.gap.prediction_error.likelihood_fit import maximise_likelihood
+from bench.gap.prediction_error.model_filters import GAUSS_NEWTON_STEPS, SOFT_FACTORS
 from bench.gap.unit_check import Subject
 from sims.base import Array
 from sims.recording.recording import Recording, Run
@@ -135,6 +136,7 @@ class ConventionComparison:
         if not differences or gain < self._gain_of_causes(corrected) + CAUSES_MARGIN:
             return []
         before, after = (_log_likelihood(self._follow(one)) for one in (described, corrected))
+        after += sum(_log_scales(one.hypothesis, described) for one in differences)
         return differences if after > before + LOG_LIKELIHOOD_MARGIN else []
 
     def _suspects(self, followed: FollowedRuns) -> list[Joint]:
@@ -156,6 +158,8 @@ class ConventionComparison:
     ) -> Difference | None:
         """Return the hypothesis with the largest likelihood; None where none is clearly ahead."""
         limit = self._evaluate(Hypothesis(""), recording) + LOG_LIKELIHOOD_MARGIN
+        # Most hypotheses fail on one run already.
+        first_limit = self._evaluate(Hypothesis(""), recording, runs=1)
         scored: dict[str, tuple[float, Hypothesis]] = {}
         evaluated: list[object] = []
         for hypothesis in self._generator.generate(recording, suspects):
@@ -163,6 +167,8 @@ class ConventionComparison:
             if key in evaluated:
                 continue
             evaluated.append(key)
+            if not self._evaluate(hypothesis, recording, runs=1) > first_limit:
+                continue
             score = self._evaluate(hypothesis, recording)
             # Of several offsets of one signal the best one is refined.
             known = scored.get(hypothesis.description, (limit, hypothesis))
@@ -201,16 +207,20 @@ class ConventionComparison:
         offset = max(abs(change.offset) for change in hypothesis.changes.values())
         return (score if offset > MIN_OFFSET else -np.inf), hypothesis
 
-    def _evaluate(self, hypothesis: Hypothesis, recording: Recording) -> float:
-        """Return the log likelihood (1) on the short parts of a recording."""
+    def _evaluate(
+        self, hypothesis: Hypothesis, recording: Recording, runs: int = PART_RUNS
+    ) -> float:
+        """Return the log likelihood (1) on the short parts of a recording.
+
+        Args:
+            hypothesis: how its conventions differ.
+            recording: as it is described, or with some conventions corrected.
+            runs: maximum number of runs.
+        """
         self.evaluations += 1
-        parts = self._parts(hypothesis.applied(recording))
-        result = _log_likelihood(self._follow(parts, max_linearisations=1))
-        for name, change in hypothesis.changes.items():
-            if name in parts.runs[0].channels:
-                count = sum(int(np.isfinite(run.channels[name]).sum()) for run in parts.runs)
-                result += count * math.log(abs(change.scale))
-        return result
+        parts = self._parts(hypothesis.applied(recording), runs)
+        followed = self._follow(parts, max_linearisations=1)
+        return _log_likelihood(followed) + _log_scales(hypothesis, parts)
 
     def _follow(
         self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
@@ -261,30 +271,45 @@ class ConventionComparison:
             theta = world.nominal()
             for one, numbers in zip(groups, selected.regression.solve(groups)[1], strict=True):
                 theta[world.slots[one.effect]] = _coefficients(world, probes, one, numbers)
-            after = followed.with_parameters(theta).log_likelihood
-            gain = max(gain, after - before - penalty)
+            fitted = _with_best_coefficients(followed.with_parameters(theta), groups)
+            gain = max(gain, fitted.log_likelihood - before - penalty)
         gain = max(gain, _log_likelihood_of_soft_friction(followed) - before)
         world.close()
         if not self._suspects(self._follow(self._parts(corrected))):
             return gain
         return max(gain, selected.log_likelihood - followed.log_likelihood - penalty)
 
-    def _parts(self, recording: Recording) -> Recording:
+    def _parts(self, recording: Recording, runs: int = PART_RUNS) -> Recording:
         """Return the parts of some training runs in which most moves."""
-        runs = recording.training()[:PART_RUNS]
-        parts = [run.part(part) for run, part in zip(runs, self._slices, strict=True)]
-        return replace(recording, runs=tuple(parts))
+        pairs = zip(recording.training(), self._slices[:runs], strict=False)
+        return replace(recording, runs=tuple(run.part(part) for run, part in pairs))
 
     @cached_property
     def _slices(self) -> list[slice]:
-        """Samples of these parts."""
-        return [_liveliest_part(run) for run in self.subject.recording.training()[:PART_RUNS]]
+        """Samples of these parts. Where a joint is not recorded, only the beginning of a run has a
+        known pose.
+        """
+        runs = self.subject.recording.training()[:PART_RUNS]
+        coordinates = self.subject.kind.system.coordinates
+        if not all(coordinate in runs[0].channels for coordinate in coordinates):
+            return [slice(0, min(run.times.size, PART_SAMPLES)) for run in runs]
+        return [_liveliest_part(run) for run in runs]
 
 
 def _log_likelihood(followed: FollowedRuns) -> float:
     """Return the log likelihood of the innovations; minus infinity where the filter diverges."""
     likelihood = followed.log_likelihood
     return likelihood if np.isfinite(likelihood) and followed.is_sound else -np.inf
+
+
+def _log_scales(hypothesis: Hypothesis, recording: Recording) -> float:
+    """Return the last term of (1) for the training runs of a recording."""
+    result = 0.0
+    for name, change in hypothesis.changes.items():
+        samples = [run.channels[name] for run in recording.training() if name in run.channels]
+        count = sum(int(np.isfinite(values).sum()) for values in samples)
+        result += count * math.log(abs(change.scale))
+    return result
 
 
 def _white_noise(world: World, recording: Recording) -> Noise:
@@ -312,6 +337,19 @@ def _coefficients(world: World, probes: Sequence[Probe], group: Group, numbers: 
         if not probes[column].fixed:
             c[probes[column].place] = value
     return clip_coefficients(world, group.effect, c)
+
+
+def _with_best_coefficients(followed: FollowedRuns, groups: Sequence[Group]) -> FollowedRuns:
+    """Improve the coefficients of effects by Gauss-Newton steps of the filter's likelihood."""
+    world = followed.world
+    names = [group.effect for group in groups]
+    return maximise_likelihood(
+        followed,
+        [place for name in names for place in world.places(name)],
+        [bounds for name in names for bounds in coefficient_bounds(world, name)],
+        GAUSS_NEWTON_STEPS,
+        lambda theta, best: best.with_parameters(theta),
+    )
 
 
 def _log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
