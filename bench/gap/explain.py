@@ -255,7 +255,7 @@ class _Explainer:
         self.recording, quiet = add_least_noise(self.recording, names)
         said = thinned, settled, note, _added_noise(quiet)
         self.notes = tuple(text for text in said if text)
-        for note in (*self.recording.notes, *self.notes):
+        for note in self.notes:
             say(note)
         check_recording(self.recording, kind(engine=self.engine), force)
         self.watch = watch

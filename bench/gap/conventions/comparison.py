@@ -64,6 +64,12 @@ SUSPECT_SHARE = 0.1
 """Missing force of a joint, as a share of its typical force and of the largest such share, from
 which its conventions are questioned.
 """
+MAX_REMAINING_FORCE = 0.3
+"""Largest missing force with corrected conventions, as a share of the one before."""
+MAX_SUSPECT_LIMIT = 0.5
+"""Missing force of a joint, as a share of its typical force, from which its conventions are
+questioned in any case.
+"""
 PART_SAMPLES = 60
 """Number of samples of the part of a run on which hypotheses are compared."""
 PART_RUNS = 3
@@ -135,9 +141,23 @@ class ConventionComparison:
         gain = sum(one.gain for one in differences)
         if not differences or gain < self._gain_of_causes(corrected) + CAUSES_MARGIN:
             return []
+        if not self._removes_missing_force(described, corrected):
+            return []
         before, after = (_log_likelihood(self._follow(one)) for one in (described, corrected))
         after += sum(_log_scales(one.hypothesis, described) for one in differences)
         return differences if after > before + LOG_LIKELIHOOD_MARGIN else []
+
+    def _removes_missing_force(self, described: Recording, corrected: Recording) -> bool:
+        """Return whether corrections leave little of the largest missing force."""
+        before, after = map(self._largest_missing_force, (described, corrected))
+        return after <= MAX_REMAINING_FORCE * before
+
+    def _largest_missing_force(self, recording: Recording) -> float:
+        """Return the largest missing force of a joint, as a share of its typical force; infinity
+        where the filter diverges.
+        """
+        followed = self._follow(self._parts(recording))
+        return float((followed.force / followed.typical).max()) if followed.is_sound else np.inf
 
     def _suspects(self, followed: FollowedRuns) -> list[Joint]:
         """Return the joints at which a large force is missing; all where the filter diverges."""
@@ -147,7 +167,7 @@ class ConventionComparison:
         shares = (followed.force / followed.typical)[: len(coordinates)]
         if not followed.missing_forces.any() or shares.max() <= MIN_MISSING_FORCE:
             return []
-        limit = SUSPECT_SHARE * max(1.0, float(shares.max()))
+        limit = min(SUSPECT_SHARE * max(1.0, float(shares.max())), MAX_SUSPECT_LIMIT)
         if shares.max() < LARGE_MISSING_FORCE:
             limit = float(np.nextafter(shares.max(), 0.0))
         share_of = dict(zip(coordinates, shares.tolist(), strict=True))
@@ -275,7 +295,7 @@ class ConventionComparison:
             gain = max(gain, fitted.log_likelihood - before - penalty)
         gain = max(gain, _log_likelihood_of_soft_friction(followed) - before)
         world.close()
-        if not self._suspects(self._follow(self._parts(corrected))):
+        if self._largest_missing_force(corrected) < LARGE_MISSING_FORCE:
             return gain
         return max(gain, selected.log_likelihood - followed.log_likelihood - penalty)
 
