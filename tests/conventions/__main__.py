@@ -1,4 +1,4 @@
-"""Conventions of random logs: ``python -m tests.conventions [--count 200] [--seed 100] [--out
+"""Conventions of random logs: ``python -m tests.conventions [--count 120] [--seed 100] [--out
 DIR]``.
 
 As many logs with one convention broken as sound logs with a cause. One row a log is added to
@@ -22,7 +22,7 @@ COLUMNS = ("log", "broken", "cause", "joints", "size", "found", "right", "evalua
 
 def main(arguments):
     parser = argparse.ArgumentParser(prog="python -m tests.conventions", description=__doc__)
-    parser.add_argument("--count", type=int, default=200, help="logs of each kind")
+    parser.add_argument("--count", type=int, default=120, help="logs of each kind")
     parser.add_argument("--seed", type=int, default=100, help="of the first log")
     parser.add_argument("--out", type=Path, default=Path("results/conventions"))
     given = parser.parse_args(arguments)
