@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from sims.base import Array, InputError, unknown
 from sims.user_toml import table, text
 
-if TYPE_CHECKING:
-    from sims.recording.recording import Run
-
 Mask = NDArray[np.bool_]
+Run: TypeAlias = Any
+"""A `sims.recording.recording.Run`, whose module imports this one."""
 
 KEYS = ("enable", "disable")
 """Keys of ``[actuators.NAME]`` that name such a column."""

@@ -64,6 +64,8 @@ SUSPECT_SHARE = 0.1
 """Missing force of a joint, as a share of its typical force and of the largest such share, from
 which its conventions are questioned.
 """
+OFF_FACTOR = 1e-6
+"""Factor that switches an input off."""
 MAX_REMAINING_FORCE = 0.3
 """Largest missing force with corrected conventions, as a share of the one before."""
 MAX_SUSPECT_LIMIT = 0.5
@@ -196,7 +198,11 @@ class ConventionComparison:
                 scored[hypothesis.description] = score, hypothesis
         ahead = sorted(scored.values(), key=lambda pair: -pair[0])
         refined = [self._refine(*pair, recording) for pair in ahead[:MAX_REFINED]]
-        clear = [pair for pair in (*refined, *ahead[MAX_REFINED:]) if pair[0] > limit]
+        clear = [
+            (score, one)
+            for score, one in (*refined, *ahead[MAX_REFINED:])
+            if score > limit and self._uses_inputs(score, one, recording)
+        ]
         if not clear:
             return None
         best = max(score for score, _ in clear)
@@ -204,6 +210,20 @@ class ConventionComparison:
         first, *others = sorted(equal, key=lambda one: one.size)
         gain = best - limit + LOG_LIKELIHOOD_MARGIN
         return Difference(first, gain, tuple(others[: MAX_NAMED - 1]))
+
+    def _uses_inputs(self, score: float, hypothesis: Hypothesis, recording: Recording) -> bool:
+        """Return whether a hypothesis on units of inputs alone is better than no inputs at all: a
+        factor that only switches an input off is not a unit.
+        """
+        inputs = recording.runs[0].inputs
+        if hypothesis.unit is None or any(name not in inputs for name in hypothesis.changes):
+            return True
+        changes = {
+            name: replace(change, scale=OFF_FACTOR * change.scale)
+            for name, change in hypothesis.changes.items()
+        }
+        without = self._evaluate(replace(hypothesis, changes=changes), recording)
+        return score > without + LOG_LIKELIHOOD_MARGIN
 
     def _refine(
         self, score: float, hypothesis: Hypothesis, recording: Recording
