@@ -7,6 +7,7 @@ program uses it.
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -44,6 +45,19 @@ _WORDS: Mapping[type, str] = {
 
 _WIDER: Mapping[type, tuple[type, ...]] = {float: (int, float), list: (list, tuple)}
 """Types that pass for another: a TOML number may have no point, a list from Python may be fixed."""
+
+
+def toml_text(text: str) -> str:
+    """Return a text as a string of TOML."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def toml_key(name: str) -> str:
+    """Return a name as a key of TOML: in quotation marks if it has other characters than letters
+    and digits of ASCII, ``_`` and ``-``.
+    """
+    bare = name.replace("_", "").replace("-", "")
+    return name if bare.isascii() and bare.isalnum() else toml_text(name)
 
 
 def read_toml(path: Path) -> dict[str, Any]:

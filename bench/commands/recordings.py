@@ -19,7 +19,7 @@ from bench.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from bench.gap.conventions.comparison import Difference
+    from bench.gap.conventions.comparison import ConventionDifference
     from sims.base import Simulator
     from sims.recording.recording import Recording
 
@@ -195,11 +195,12 @@ def _inspect(options: argparse.Namespace, say: Say) -> Answer:
     ):
         say(line)
     folder = options.out or Path("results/inspect", options.recording.resolve().parent.name)
-    files = draw(recording, kind, folder)
+    corrected: list[Path] = []
     if options.fix:
         from bench.gap.conventions.corrected_description import write_corrected
 
-        files += write_corrected(options.recording, kind, differences, options.fix)
+        corrected = write_corrected(options.recording, kind, differences, options.fix)
+    files = [*draw(recording, kind, folder), *corrected]
     for path in files:
         say(str(path))
     numbers = _checked(options, say) if options.check else None
@@ -225,7 +226,7 @@ def _inspect(options: argparse.Namespace, say: Say) -> Answer:
 
 def _differing_conventions(
     options: argparse.Namespace, recording: Recording, kind: type[Simulator]
-) -> tuple[list[Difference], list[str]]:
+) -> tuple[list[ConventionDifference], list[str]]:
     """Return the conventions of a robot's log that differ from those of its model file, and the
     keys of the description that correct them.
 
@@ -235,7 +236,7 @@ def _differing_conventions(
     from sims.base import InputError
     from sims.simulated import Simulated
 
-    differences: list[Difference] = []
+    differences: list[ConventionDifference] = []
     if issubclass(kind, Simulated) and kind.has_model:
         from bench.gap.conventions.comparison import ConventionComparison
         from bench.gap.unit_check import Subject

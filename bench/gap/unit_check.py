@@ -35,6 +35,7 @@ from sims.base import Array, InputError
 from sims.recording.description import stated_columns
 from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
+from sims.user_toml import toml_key
 
 GROSS = 0.1
 """Residual of the base model, as a share of the standard deviation of a channel, from which units
@@ -173,10 +174,9 @@ class Hypothesis:
         factors = self.factors()
         lines = []
         for signal, unit in zip(self.signals, self.units, strict=True):
-            name = f'"{signal.name}"' if "." in signal.name else signal.name
             keys = [f'unit = "{unit}"'] * (unit != signal.stated)
             keys += [f"scale = {self._scale(signal):.9g}"] * (self._scale(signal) != 1.0)
-            lines.append(f"[{signal.kind}.{name}] {', '.join(keys)}")
+            lines.append(f"[{signal.kind}.{toml_key(signal.name)}] {', '.join(keys)}")
         return RecordingFault(
             tuple(signal.name for signal in self.signals),
             factors[self.signals[0].name],

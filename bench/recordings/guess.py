@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from sims.base import Array
+from sims.recording.mapping import MAX_REPEATED
 from sims.recording.unit_names import read_unit, split_unit
 from sims.recording.units import scale
 from sims.robot.model import Joint
@@ -61,8 +62,6 @@ _ROLE_OF_QUANTITY: Mapping[str, Role] = {
 _TIME_WORDS = "t time times timestamp timestamps stamp stamps sec seconds secs clock zeit uhrzeit"
 TIMES = frozenset((_TIME_WORDS + " temps tiempo tempo").split())
 """Words of a column of stamps."""
-MAX_REPEATED = 0.05
-"""Maximum share of the stamps of a column that may repeat the one before."""
 UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """What a stamp's unit may be worth, seconds."""
 RATES = (2.0, 5000.0)

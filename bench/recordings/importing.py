@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
@@ -33,7 +32,7 @@ from sims.recording.units import scale
 from sims.recording.write import publish
 from sims.robot.model import Actuator, Joint, Robot
 from sims.robot.scales import scales
-from sims.user_toml import known
+from sims.user_toml import known, toml_key, toml_text
 
 QUICK, DAMPED = 20.0, 0.7
 """rad/s and share of critical damping of a servo whose gains nobody has stated or shown."""
@@ -351,12 +350,12 @@ class _Describing:
     @staticmethod
     def _columns(file: str, log: Log) -> list[Column]:
         """All columns of numbers of a log."""
-        return [
-            Column(file, name, np.where(np.isfinite(values), values, np.nan),
-                   log.units.get(name, ""))
-            for name in log.names()
-            for values in (log.column(name),)
-        ]  # fmt: skip
+        columns = []
+        for name in log.names():
+            values = log.column(name)
+            finite = np.where(np.isfinite(values), values, np.nan)
+            columns.append(Column(file, name, finite, log.units.get(name, "")))
+        return columns
 
     def _with_numbers(self, logs: dict[str, Log]) -> list[Column]:
         """The columns of the files with stamps that have a number for each of these."""
@@ -409,7 +408,7 @@ class _Describing:
             path, largest, options.position_unit, options.calibration
         )
         if self.normalised is not None:
-            self.made_of.guessed.append(f"positions: {self.normalised.says()}")
+            self.made_of.guessed.append(f"positions: {self.normalised.description}")
         elif (
             not options.position_unit
             and largest <= LARGEST
@@ -850,20 +849,24 @@ class _Describing:
 
     def _text(self) -> str:
         lines = [*(f"# check: {line}" for line in self.made_of.checks)]
-        lines += [f"model = {_quoted(self._from(self.model))}"]
+        lines += [f"model = {toml_text(self._from(self.model))}"]
         if self.added:
-            names = ", ".join(_quoted(f"{name}@*") for name in _GAINS)
+            names = ", ".join(toml_text(f"{name}@*") for name in _GAINS)
             lines.append(f"free = [{names}]  # not known: they are estimated")
         lines += ["", "[time]"]
         if self.options.rate is not None:
             lines += [f"rate = {float(self.options.rate)!r}", ""]
         else:
-            lines += [f"column = {_quoted(self.time)}", f"unit = {_quoted(self.unit)}  # guess", ""]
+            lines += [
+                f"column = {toml_text(self.time)}",
+                f"unit = {toml_text(self.unit)}  # guess",
+                "",
+            ]
         for run, files in self.runs.items():
             if run:
                 where = files.paths[0] if files.alone else files.folder
                 word = "file" if files.alone else "folder"
-                lines += [f"[runs.{_key(run)}]", f"{word} = {_quoted(self._from(where))}"]
+                lines += [f"[runs.{toml_key(run)}]", f"{word} = {toml_text(self._from(where))}"]
                 lines += [*["held_out = true"] * (run in self.options.held_out), ""]
         for name, joint in self.added.items():
             lines += self._actuator(name, joint)
@@ -875,13 +878,13 @@ class _Describing:
     def _signal_lines(self, kind: str, name: str, signal: Signal) -> list[str]:
         """The table of a channel or an input."""
         column = signal.column
-        lines = [f"[{kind}.{_quoted(name)}]  # guess: {signal.why}"]
+        lines = [f"[{kind}.{toml_text(name)}]  # guess: {signal.why}"]
         first = next(iter(self.runs.values()))
         if not first.alone:
             inside = self.runs[""].folder / column.file if "" in self.runs else None
             file = self._from(inside) if inside is not None else column.file
-            lines.append(f"file = {_quoted(file)}")
-        lines += [f"column = {_quoted(column.name)}", f"unit = {_quoted(signal.unit)}"]
+            lines.append(f"file = {toml_text(file)}")
+        lines += [f"column = {toml_text(column.name)}", f"unit = {toml_text(signal.unit)}"]
         stated = self.options.position_unit == "deg" and kind == "channels"
         if signal.scale != 1.0 or (stated and name.startswith("q.")):
             lines.append(f"scale = {signal.scale!r}")
@@ -901,7 +904,7 @@ class _Describing:
             f"gains of the servo of {joint.name}: of one of {quick:.3g} rad/s and {damped:.2g} of "
             f"critical damping, {what}; free"
         )
-        lines = [f"[actuators.{_key(name)}]", f"joint = {_quoted(joint.name)}"]
+        lines = [f"[actuators.{toml_key(name)}]", f"joint = {toml_text(joint.name)}"]
         lines += ['kind = "position"  # guess: its commands are positions']
         return [*lines, f"kp = {kp:.4g}  # guess", f"kv = {kv:.4g}  # guess", ""]
 
@@ -924,9 +927,9 @@ class _Describing:
     def _signal(self, run: str, column: Column) -> tuple[Array, Array] | None:
         """Stamps in s and values of a column in one run; None where it lacks the file or that."""
         files = self.runs[run]
-        paths = files.paths if files.alone else [
-            path for path in files.paths if files.name(path) == column.file
-        ]  # fmt: skip
+        paths = files.paths
+        if not files.alone:
+            paths = [path for path in paths if files.name(path) == column.file]
         if not paths:
             return None
         log = self._log(paths[0])
@@ -967,12 +970,3 @@ def _converts(unit: str, target: str) -> bool:
     except InputError:
         return False
     return bool(unit)
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
-
-
-def _key(name: str) -> str:
-    bare = name.replace("_", "").replace("-", "")
-    return name if bare.isascii() and bare.isalnum() else _quoted(name)

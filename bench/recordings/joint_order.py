@@ -34,16 +34,10 @@ def order_of_commands(commands: Sequence[Array], positions: Sequence[Array]) -> 
         For each command the place of the position that follows it; None where the order as it is
         follows about as well, or the motion tells nothing.
     """
-    # Loaded here alone: it is much.
-    from scipy.optimize import linear_sum_assignment
-
-    u, q = np.array(commands), np.array(positions)
-    known = np.isfinite(u).all(axis=0) & np.isfinite(q).all(axis=0)
-    if known.sum() < MIN_SAMPLES or len(u) < 2:
+    distances = _distances(commands, positions)
+    if distances is None:
         return None
-    distances = np.mean((u[:, None, known] - q[None][:, :, known]) ** 2, axis=2)
-    _, places = linear_sum_assignment(distances)
-    order: list[int] = places.tolist()
+    order = least_order(distances)
     moved = [i for i, place in enumerate(order) if place != i]
     if not moved:
         return None
@@ -54,9 +48,33 @@ def order_of_commands(commands: Sequence[Array], positions: Sequence[Array]) -> 
 
 def follow(commands: Sequence[Array], positions: Sequence[Array]) -> bool:
     """Return whether each position is closer to its own command than to any other one."""
-    u, q = np.array(commands), np.array(positions)
-    known = np.isfinite(u).all(axis=0) & np.isfinite(q).all(axis=0)
-    if known.sum() < MIN_SAMPLES or len(u) < 2:
+    distances = _distances(commands, positions)
+    if distances is None:
         return False
-    distances = np.mean((u[:, None, known] - q[None][:, :, known]) ** 2, axis=2)
-    return bool((np.argmin(distances, axis=1) == np.arange(len(u))).all())
+    return bool((np.argmin(distances, axis=1) == np.arange(len(distances))).all())
+
+
+def least_order(distances: Array) -> list[int]:
+    """Return the order that makes (1) least, by linear assignment.
+
+    Args:
+        distances: (J, J) mean square distance of each command (rows) from each position (columns).
+    """
+    # SciPy's optimisers are slow to import.
+    from scipy.optimize import linear_sum_assignment
+
+    _, places = linear_sum_assignment(distances)
+    order: list[int] = places.tolist()
+    return order
+
+
+def _distances(commands: Sequence[Array], positions: Sequence[Array]) -> Array | None:
+    """Return the mean square distance (J, J) of each command from each position; None where the
+    motion is too short, or of one joint.
+    """
+    u, q = np.array(commands), np.array(positions)
+    finite = np.isfinite(u).all(axis=0) & np.isfinite(q).all(axis=0)
+    if finite.sum() < MIN_SAMPLES or len(u) < 2:
+        return None
+    squares: Array = np.mean((u[:, None, finite] - q[None][:, :, finite]) ** 2, axis=2)
+    return squares

@@ -10,9 +10,9 @@ from sims.base import InputError
 from sims.recording.bags import ENDINGS, is_bag
 from sims.recording.hdf5 import is_hdf5, runs_in
 from sims.recording.lerobot import is_dataset
-from sims.recording.logs import logs_in, read_log
+from sims.recording.logs import FORMATS, logs_in, read_log
 
-TABLES = (".csv", ".tsv", ".npz", ".parquet", ".pt", ".pth", ".h5", ".hdf5", ".hdf")
+TABLES = tuple(ending for ending in FORMATS if ending not in (".txt", ".dat"))
 """Endings of what is taken from a folder; other texts may be anything."""
 
 

@@ -19,6 +19,7 @@ from sims.recording.lerobot_calibration import (
     angle_scale,
     find_calibration,
     motor_of,
+    range_scale,
     read_calibration,
 )
 from sims.recording.recording import Recording
@@ -65,21 +66,15 @@ class NormalisedPositions:
             return "deg", angle_scale(self.motors[motor], from_zero)
         if joint.range is None:
             return None
-        low, high = joint.range
-        if from_zero:
-            return joint.unit, AngleScale((high - low) / 100.0, low)
-        return joint.unit, AngleScale((high - low) / 200.0, (high + low) / 2.0)
+        return joint.unit, range_scale(*joint.range, from_zero)
 
-    def says(self) -> str:
-        """Return by what the positions become angles."""
-        if self.source is None:
-            return (
-                "normalised, -100 to 100 (a gripper's 0 to 100) of the joints' ranges in the model"
-            )
-        return (
-            "normalised, -100 to 100 (a gripper's 0 to 100) of the ranges in "
-            f"{self.source.name}, zero in the middle of each"
-        )
+    @property
+    def description(self) -> str:
+        """The ranges to which the positions are normalised."""
+        ranges = "the joints' ranges in the model"
+        if self.source is not None:
+            ranges = f"the ranges in {self.source.name}, zero in the middle of each"
+        return f"normalised, -100 to 100 (a gripper's 0 to 100) of {ranges}"
 
 
 def normalised_positions(
@@ -134,11 +129,14 @@ def may_be_normalised(recording: Recording) -> Iterator[Oddity]:
     degrees = [
         name
         for name, own in channels.items()
-        if isinstance(own, dict) and str(own.get("unit", "")).startswith("deg")
-        and "scale" not in own and name.startswith("q.")
-    ]  # fmt: skip
-    values = [run.channels[name] for run in recording.runs for name in degrees
-              if name in run.channels]  # fmt: skip
+        if name.startswith("q.")
+        and isinstance(own, dict)
+        and str(own.get("unit", "")).startswith("deg")
+        and "scale" not in own
+    ]
+    values = [
+        run.channels[name] for run in recording.runs for name in degrees if name in run.channels
+    ]
     largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in values), default=np.inf)
     if np.degrees(largest) <= LARGEST:
         yield Oddity(
@@ -151,8 +149,8 @@ def may_be_normalised(recording: Recording) -> Iterator[Oddity]:
 def _episodes(description: Path, meta: Mapping[str, object]) -> bool:
     """Whether a description's runs are episodes of a dataset."""
     runs = meta.get("runs")
-    folders = [own.get("folder") for own in runs.values() if isinstance(own, dict)] if isinstance(
-        runs, dict) else []  # fmt: skip
+    tables = runs.values() if isinstance(runs, dict) else ()
+    folders = [own.get("folder") for own in tables if isinstance(own, dict)]
     return any(
         isinstance(folder, str) and episode_of(description.parent / folder / "frames") is not None
         for folder in folders[:1]

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sims.base import Array
+from sims.robot.inverse_dynamics import motion_forces
 from sims.robot.model import Actuator, Joint, Robot
 from sims.robot.quiet import quiet
 
@@ -78,17 +79,13 @@ def preferred_order(
     known &= np.diff(times, prepend=-np.inf) > 0
     if known.sum() < 4 * WINDOW or len(driven) < 2:
         return None
-    # Loaded here alone: it is much.
+    # SciPy's signal module is slow to import.
     from scipy.signal import savgol_filter
 
     t, u, q = times[known], np.array(commands)[:, known], np.array(positions)[:, known]
     step = float(np.median(np.diff(t)))
-    motion = np.stack(
-        [
-            savgol_filter(q, WINDOW, DEGREE, deriv=order, delta=step, axis=1)
-            for order in (0, 1, 2)
-        ]
-    )  # fmt: skip
+    derivatives = [savgol_filter(q, WINDOW, DEGREE, deriv=k, delta=step, axis=1) for k in range(3)]
+    motion = np.stack(derivatives)
     inside = np.linspace(WINDOW, t.size - WINDOW - 1, min(INSTANTS, t.size - 2 * WINDOW))
     rows = np.unique(inside.astype(np.intp))
     residuals = {
@@ -106,9 +103,10 @@ def _orders(names: Sequence[str]) -> Iterator[tuple[int, ...]]:
         yield from permutations(range(count))
         return
     by_name = sorted(range(count), key=lambda place: names[place])
+    as_stated = list(range(count))
     # The column of joint j stands where its name does in the sorted list.
-    for order in (list(range(count)), [by_name.index(j) for j in range(count)],
-                  list(range(count))[::-1]):  # fmt: skip
+    alphabetical = [by_name.index(j) for j in range(count)]
+    for order in (as_stated, alphabetical, as_stated[::-1]):
         yield tuple(order)
         for one, other in combinations(range(count), 2):
             own = list(order)
@@ -137,22 +135,11 @@ def _residual(
     model = copy.copy(robot.compiled)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
-    data = mujoco.MjData(model)
-    missing = acting = 0.0
+    controls = np.zeros((commands.shape[1], model.nu))
+    controls[:, [actuator.control for _, actuator in driven]] = commands.T
+    joints = [joint for joint, _ in driven]
     with quiet():
-        for row in range(commands.shape[1]):
-            mujoco.mj_resetData(model, data)
-            for place, (joint, actuator) in enumerate(driven):
-                data.qpos[joint.position] = motion[0, place, row]
-                data.qvel[joint.velocity] = motion[1, place, row]
-                data.ctrl[actuator.control] = commands[place, row]
-            mujoco.mj_forward(model, data)
-            exerted = data.qfrc_actuator.copy()
-            data.qacc[:] = 0.0
-            for place, (joint, _) in enumerate(driven):
-                data.qacc[joint.velocity] = motion[2, place, row]
-            mujoco.mj_inverse(model, data)
-            own = [joint.velocity for joint, _ in driven]
-            missing += float(np.sum((data.qfrc_inverse[own] - exerted[own]) ** 2))
-            acting += float(np.sum(exerted[own] ** 2))
+        forces = motion_forces(model, joints, np.swapaxes(motion, 1, 2), controls)
+    missing = float(np.sum((forces.needed - forces.driven) ** 2))
+    acting = float(np.sum(forces.driven**2))
     return float(np.sqrt(missing / acting)) if acting > 0 else np.inf

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sims.base import Array, InputError, unknown
-from sims.user_toml import table, text
+from sims.user_toml import table, text, toml_key
 
 Mask = NDArray[np.bool_]
 Run: TypeAlias = Any
@@ -28,8 +28,6 @@ FEWEST = 10
 """Smallest number of samples of a part of a run: fewer say nothing beside an initial state."""
 MOST_RUNS = 6
 """Maximum number of runs that a message names."""
-MOST_SPANS = 3
-"""Maximum number of spans of one run that a message names."""
 
 
 class DriveSwitch(NamedTuple):
@@ -60,18 +58,12 @@ class DriveSwitch(NamedTuple):
     def line(self) -> str:
         """The table of the description that states it."""
         key = "enable" if self.zero_is_off else "disable"
-        return f'[actuators.{_key(self.actuator)}] {key} = "{self.column}"'
+        return f'[actuators.{toml_key(self.actuator)}] {key} = "{self.column}"'
 
     @property
     def condition(self) -> str:
         """When the drive is off, in words."""
         return f"{self.column} is {'0' if self.zero_is_off else 'not 0'}"
-
-
-def _key(name: str) -> str:
-    """A name as a key of TOML."""
-    bare = name.isascii() and name.replace("_", "").replace("-", "").isalnum()
-    return name if bare else f'"{name}"'
 
 
 def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...]:

@@ -38,7 +38,7 @@ class MotorRange(NamedTuple):
 
 
 class AngleScale(NamedTuple):
-    """How a normalised position becomes an angle in degrees: ``gain`` times it plus ``offset``."""
+    """How a normalised position becomes an angle: ``gain`` times it plus ``offset``."""
 
     gain: float
     offset: float
@@ -103,6 +103,16 @@ def angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
     if from_zero:
         return AngleScale(sign * degrees / 100.0, -sign * degrees / 2.0)
     return AngleScale(sign * degrees / 200.0, 0.0)
+
+
+def range_scale(lowest: float, highest: float, from_zero: bool) -> AngleScale:
+    """Return how a position that is normalised to a range becomes one in the unit of the range:
+    -100 to 100, or 0 to 100 if it is `from_zero`.
+    """
+    width = highest - lowest
+    if from_zero:
+        return AngleScale(width / 100.0, lowest)
+    return AngleScale(width / 200.0, (highest + lowest) / 2.0)
 
 
 def _motors(document: Any) -> Mapping[str, Mapping[str, Any]] | None:

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from bench.cli import main
-from bench.gap.conventions.comparison import ConventionComparison, Difference
+from bench.gap.conventions.comparison import ConventionComparison, ConventionDifference
 from bench.gap.conventions.corrected_description import corrected, lines_of
-from bench.gap.conventions.hypotheses import Change, Hypothesis
+from bench.gap.conventions.hypotheses import ConventionHypothesis, SignalChange
 from bench.gap.unit_check import Subject
 from bench.recordings.inspection import load
 from sims.recording.description import read_meta
 from sims.recording.turns import unwrapped
 from tests.conventions.logs import BROKEN, CAUSES, write_log
+from tests.malformed import sound
 
 SEEDS = {
     "sign of position": (12, "the sign of q.j1, qd.j1 looks reversed"),
@@ -71,7 +72,7 @@ def test_a_cause_is_no_broken_convention(cause, tmp_path):
 def test_a_change_that_transforms_nothing_finds_nothing(tmp_path, monkeypatch):
     log = write_log(tmp_path / "log", *_seed("sign of command"))
     assert check(log.path).differences() != []
-    monkeypatch.setattr(Change, "applied", lambda change, signals: signals[change.source])
+    monkeypatch.setattr(SignalChange, "applied", lambda change, signals: signals[change.source])
     assert check(log.path).differences() == []
 
 
@@ -82,6 +83,16 @@ def test_soft_friction_is_no_other_zero(tmp_path):
     log = write_log(tmp_path / "log", 2002, None, "friction")
     comparison = check(log.path)
     assert comparison.differences() == []
+
+
+def test_a_model_that_diverges_between_samples_tells_nothing(tmp_path):
+    """Stamps in milliseconds read as seconds: in 20 s an unstable joint exceeds all numbers."""
+    model = sound.ARM.replace(b'name="hip"', b'name="hip" stiffness="-5e4"')
+    (tmp_path / "arm.xml").write_bytes(model)
+    (tmp_path / "log.csv").write_bytes(sound.logs()["log.csv"])
+    mapped = {**sound.MAPPED, "time": {"column": "stamp"}}
+    (tmp_path / "mapped.toml").write_bytes(sound.toml(mapped))
+    assert check(tmp_path / "mapped.toml").differences() == []
 
 
 def _seed(broken):
@@ -111,8 +122,8 @@ def test_the_corrected_description_reads_as_the_change_says(tmp_path):
     path.write_text(text)
     recording, kind = load(log.path)
     before = recording.runs[0].channels["q.j1"]
-    change = Hypothesis("", {"q.j1": Change("q.j1", -1.0, 0.5)})
-    differences = [Difference(change, 1.0)]
+    change = ConventionHypothesis("", {"q.j1": SignalChange("q.j1", -1.0, 0.5)})
+    differences = [ConventionDifference(change, 1.0)]
     _, meta = read_meta(log.path)
     after = corrected(meta, kind, differences)["channels"]["q.j1"]
     degree = math.pi / 180.0

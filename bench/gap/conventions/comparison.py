@@ -23,30 +23,30 @@ from functools import cached_property
 
 import numpy as np
 
-from bench.gap.causes.candidates import Probe, first_probes
+from bench.gap.causes.candidates import first_probes
 from bench.gap.causes.gains import Group
 from bench.gap.causes.structure import probes as force_probes
 from bench.gap.conventions.hypotheses import (
     MAX_NAMED,
     MIN_OFFSET,
-    Hypothesis,
+    ConventionHypothesis,
     HypothesisGenerator,
-    Joint,
+    JointSignals,
 )
-from bench.gap.friction_form import has_soft_form, soft_kind
+from bench.gap.friction_form import soft_kind
 from bench.gap.identify import listed
-from bench.gap.model.bounds import clip_coefficients, coefficient_bounds
+from bench.gap.model.bounds import coefficient_bounds
 from bench.gap.model.floor import noise_floor
 from bench.gap.model.noise import Noise
 from bench.gap.model.problem import Fit
 from bench.gap.model.world import World
 from bench.gap.prediction_error.candidate_responses import MAX_LINEARISATIONS, FollowedRuns
 from bench.gap.prediction_error.identification import identify
-from bench.gap.prediction_error.joint_effects import MANY_SHAPES, joint_name
+from bench.gap.prediction_error.joint_effects import MANY_SHAPES
+from bench.gap.prediction_error.library_columns import group_coefficients
 from bench.gap.prediction_error.likelihood_fit import maximise_likelihood
-from bench.gap.prediction_error.model_filters import GAUSS_NEWTON_STEPS, SOFT_FACTORS
+from bench.gap.prediction_error.model_filters import GAUSS_NEWTON_STEPS, soft_friction_models
 from bench.gap.unit_check import Subject
-from sims.base import Array
 from sims.recording.recording import Recording, Run
 from sims.robot.simulator import RobotSimulator
 
@@ -55,7 +55,7 @@ LOG_LIKELIHOOD_MARGIN = 20.0
 CAUSES_MARGIN = 10.0
 """Log likelihood by which it must exceed the best set of causes."""
 EQUAL_LOG_LIKELIHOOD = 3.0
-"""Difference of log likelihoods below which two hypotheses explain a log equally well."""
+"""ConventionDifference of log likelihoods below which two hypotheses explain a log equally well."""
 MIN_MISSING_FORCE, LARGE_MISSING_FORCE = 0.1, 0.3
 """Largest missing force of a joint, as a share of its typical force: below the first no convention
 is questioned, and below the second those of this joint alone.
@@ -91,7 +91,7 @@ GAIN_EFFECTS = frozenset({"input.gain", "sensor.gain"})
 
 
 @dataclass(frozen=True)
-class Difference:
+class ConventionDifference:
     """A convention of the log that differs from that of the model file.
 
     Attributes:
@@ -100,9 +100,9 @@ class Difference:
         alternatives: hypotheses that explain the log equally well.
     """
 
-    hypothesis: Hypothesis
+    hypothesis: ConventionHypothesis
     gain: float
-    alternatives: tuple[Hypothesis, ...] = ()
+    alternatives: tuple[ConventionHypothesis, ...] = ()
 
     @property
     def description(self) -> str:
@@ -129,10 +129,10 @@ class ConventionComparison:
         self.evaluations = 0
         self._generator = HypothesisGenerator(subject)
 
-    def differences(self) -> list[Difference]:
+    def differences(self) -> list[ConventionDifference]:
         """Return the conventions that differ, the most certain first; an empty list if none do."""
         described = corrected = self.subject.recording
-        differences: list[Difference] = []
+        differences: list[ConventionDifference] = []
         for _ in range(MAX_DIFFERENCES):
             suspects = self._suspects(self._follow(self._parts(corrected)))
             best = self._best_hypothesis(corrected, suspects) if suspects else None
@@ -161,7 +161,7 @@ class ConventionComparison:
         followed = self._follow(self._parts(recording))
         return float((followed.force / followed.typical).max()) if followed.is_sound else np.inf
 
-    def _suspects(self, followed: FollowedRuns) -> list[Joint]:
+    def _suspects(self, followed: FollowedRuns) -> list[JointSignals]:
         """Return the joints at which a large force is missing; all where the filter diverges."""
         if not followed.is_sound:
             return self._generator.joints
@@ -176,13 +176,13 @@ class ConventionComparison:
         return [j for j in self._generator.joints if share_of[f"q.{j.name}"] > limit]
 
     def _best_hypothesis(
-        self, recording: Recording, suspects: Sequence[Joint]
-    ) -> Difference | None:
+        self, recording: Recording, suspects: Sequence[JointSignals]
+    ) -> ConventionDifference | None:
         """Return the hypothesis with the largest likelihood; None where none is clearly ahead."""
-        limit = self._evaluate(Hypothesis(""), recording) + LOG_LIKELIHOOD_MARGIN
+        limit = self._evaluate(ConventionHypothesis(""), recording) + LOG_LIKELIHOOD_MARGIN
         # Most hypotheses fail on one run already.
-        first_limit = self._evaluate(Hypothesis(""), recording, runs=1)
-        scored: dict[str, tuple[float, Hypothesis]] = {}
+        first_limit = self._evaluate(ConventionHypothesis(""), recording, runs=1)
+        scored: dict[str, tuple[float, ConventionHypothesis]] = {}
         evaluated: list[object] = []
         for hypothesis in self._generator.generate(recording, suspects):
             key = dict(hypothesis.changes), hypothesis.late
@@ -209,30 +209,30 @@ class ConventionComparison:
         equal = [one for score, one in clear if score > best - EQUAL_LOG_LIKELIHOOD]
         first, *others = sorted(equal, key=lambda one: one.size)
         gain = best - limit + LOG_LIKELIHOOD_MARGIN
-        return Difference(first, gain, tuple(others[: MAX_NAMED - 1]))
+        return ConventionDifference(first, gain, tuple(others[: MAX_NAMED - 1]))
 
-    def _uses_inputs(self, score: float, hypothesis: Hypothesis, recording: Recording) -> bool:
+    def _uses_inputs(
+        self, score: float, hypothesis: ConventionHypothesis, recording: Recording
+    ) -> bool:
         """Return whether a hypothesis on units of inputs alone is better than no inputs at all: a
         factor that only switches an input off is not a unit.
         """
         inputs = recording.runs[0].inputs
-        if hypothesis.unit is None or any(name not in inputs for name in hypothesis.changes):
+        changes = hypothesis.changes
+        scales_inputs = all(name in inputs and abs(c.scale) != 1.0 for name, c in changes.items())
+        if not changes or not scales_inputs:
             return True
-        changes = {
-            name: replace(change, scale=OFF_FACTOR * change.scale)
-            for name, change in hypothesis.changes.items()
-        }
-        without = self._evaluate(replace(hypothesis, changes=changes), recording)
+        off = {name: replace(c, scale=OFF_FACTOR * c.scale) for name, c in changes.items()}
+        without = self._evaluate(replace(hypothesis, changes=off), recording)
         return score > without + LOG_LIKELIHOOD_MARGIN
 
     def _refine(
-        self, score: float, hypothesis: Hypothesis, recording: Recording
-    ) -> tuple[float, Hypothesis]:
+        self, score: float, hypothesis: ConventionHypothesis, recording: Recording
+    ) -> tuple[float, ConventionHypothesis]:
         """Improve the offset of a hypothesis by a pattern search (R. Hooke, T. A. Jeeves, J. ACM
         8(2), 212, 1961, doi:10.1145/321062.321069).
         """
-        changes = hypothesis.changes.values()
-        if hypothesis.unit is not None or not any(change.offset for change in changes):
+        if not hypothesis.has_free_offset:
             return score, hypothesis
         step = FIRST_OFFSET_STEP
         while step > OFFSET_ACCURACY:
@@ -248,7 +248,7 @@ class ConventionComparison:
         return (score if offset > MIN_OFFSET else -np.inf), hypothesis
 
     def _evaluate(
-        self, hypothesis: Hypothesis, recording: Recording, runs: int = PART_RUNS
+        self, hypothesis: ConventionHypothesis, recording: Recording, runs: int = PART_RUNS
     ) -> float:
         """Return the log likelihood (1) on the short parts of a recording.
 
@@ -310,7 +310,7 @@ class ConventionComparison:
             groups = selected.groups[:count]
             theta = world.nominal()
             for one, numbers in zip(groups, selected.regression.solve(groups)[1], strict=True):
-                theta[world.slots[one.effect]] = _coefficients(world, probes, one, numbers)
+                theta[world.slots[one.effect]] = group_coefficients(world, probes, one, numbers)
             fitted = _with_best_coefficients(followed.with_parameters(theta), groups)
             gain = max(gain, fitted.log_likelihood - before - penalty)
         gain = max(gain, _log_likelihood_of_soft_friction(followed) - before)
@@ -342,7 +342,7 @@ def _log_likelihood(followed: FollowedRuns) -> float:
     return likelihood if np.isfinite(likelihood) and followed.is_sound else -np.inf
 
 
-def _log_scales(hypothesis: Hypothesis, recording: Recording) -> float:
+def _log_scales(hypothesis: ConventionHypothesis, recording: Recording) -> float:
     """Return the last term of (1) for the training runs of a recording."""
     result = 0.0
     for name, change in hypothesis.changes.items():
@@ -363,22 +363,6 @@ def _unfitted(world: World) -> Fit:
     return Fit((), world.nominal(), world.guess, np.zeros(0, np.intp), empty, empty, 0.0)
 
 
-def _coefficients(world: World, probes: Sequence[Probe], group: Group, numbers: Array) -> Array:
-    """Return the coefficients of an effect, within their bounds.
-
-    Args:
-        world: the runs.
-        probes: of all effects.
-        group: columns of the effect.
-        numbers: coefficients of these columns.
-    """
-    c = probes[group.columns[0]].c.copy()
-    for column, value in zip(group.columns, numbers, strict=True):
-        if not probes[column].fixed:
-            c[probes[column].place] = value
-    return clip_coefficients(world, group.effect, c)
-
-
 def _with_best_coefficients(followed: FollowedRuns, groups: Sequence[Group]) -> FollowedRuns:
     """Improve the coefficients of effects by Gauss-Newton steps of the filter's likelihood."""
     world = followed.world
@@ -397,18 +381,13 @@ def _log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
     most force is missing, which a regression does not contain; minus infinity without such an
     effect.
     """
-    world, joint = followed.world, followed.joints_by_loss[0]
-    name = f"friction.coulomb@{joint_name(world, joint)}"
-    if name not in world.library or has_soft_form(world):
+    world = followed.world
+    thetas = [theta for _, theta in soft_friction_models(followed, world.nominal())]
+    if not thetas:
         return -np.inf
     simulator = world.simulator_of(soft_kind(world.kind))
     assert isinstance(simulator, RobotSimulator)
-    likelihoods = []
-    for factor in SOFT_FACTORS:
-        theta = world.nominal()
-        limit = np.array([factor * float(followed.force[joint])])
-        theta[world.slots[name]] = clip_coefficients(world, name, limit)
-        likelihoods.append(followed.with_parameters(theta, simulator).log_likelihood)
+    likelihoods = [followed.with_parameters(theta, simulator).log_likelihood for theta in thetas]
     simulator.close()
     return max(likelihoods)
 

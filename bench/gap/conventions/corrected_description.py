@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import copy
 import os
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.gap.conventions.comparison import Difference
-from bench.gap.conventions.hypotheses import Change, Hypothesis
+from bench.gap.conventions.comparison import ConventionDifference
+from bench.gap.conventions.hypotheses import ConventionHypothesis, SignalChange
 from sims.base import InputError
 from sims.recording.description import Declared, dotted, read_meta
 from sims.recording.units import scale
+from sims.recording.write import publish
+from sims.user_toml import toml_key, toml_text
 
 KINDS = ("channels", "inputs")
 """Tables of the description that state signals."""
@@ -22,7 +23,7 @@ SHOWN = ("column", "unit", "scale", "offset", "unwrap")
 
 
 def corrected(
-    meta: Mapping[str, Any], declared: Declared, differences: Sequence[Difference]
+    meta: Mapping[str, Any], declared: Declared, differences: Sequence[ConventionDifference]
 ) -> dict[str, Any]:
     """Return the content of a description with conventions corrected one after another.
 
@@ -53,8 +54,8 @@ def corrected(
     return result
 
 
-def _moved(table: Mapping[str, Any], name: str, change: Change) -> dict[str, Any]:
-    """The table of a signal that stands in the column of another one."""
+def _moved(table: Mapping[str, Any], name: str, change: SignalChange) -> dict[str, Any]:
+    """Return the table of a signal whose numbers are in the column of another signal."""
     own = dict(table)
     if change.source != name:
         own.setdefault("column", change.source)
@@ -64,18 +65,16 @@ def _moved(table: Mapping[str, Any], name: str, change: Change) -> dict[str, Any
 
 
 def _changed(
-    table: dict[str, Any], si: str, change: Change, hypothesis: Hypothesis
+    table: dict[str, Any], si: str, change: SignalChange, hypothesis: ConventionHypothesis
 ) -> dict[str, Any]:
-    """A signal's table with another unit, scale or offset.
+    """Return the table of a signal with another unit, scale or offset.
 
     With g the gain of the stated unit, recorded numbers r are g (k r + b) in SI; the change makes
     c (g (k r + b)) + d of it, with d in SI units.
     """
     gain = scale(table["unit"], si).gain
     factor, offset = change.scale, change.offset
-    named = hypothesis.unit is not None and hypothesis.unit not in ("ticks", "normalised")
-    if named:
-        # The change is that of the unit alone.
+    if hypothesis.unit is not None:
         table["unit"] = hypothesis.unit
         return table
     k, b = float(table.get("scale", 1.0)), float(table.get("offset", 0.0))
@@ -84,7 +83,7 @@ def _changed(
     if offset or b:
         table["offset"] = _rounded(factor * b + offset / gain)
     if change.unwrap:
-        table["unwrap"] = change.near or True
+        table["unwrap"] = change.command or True
     return table
 
 
@@ -93,7 +92,7 @@ def _rounded(value: float) -> float:
 
 
 def lines_of(
-    meta: Mapping[str, Any], declared: Declared, differences: Sequence[Difference]
+    meta: Mapping[str, Any], declared: Declared, differences: Sequence[ConventionDifference]
 ) -> Iterator[str]:
     """Yield the tables of the signals that a correction changes, each in one line."""
     after, before = corrected(meta, declared, differences), corrected(meta, declared, ())
@@ -106,8 +105,7 @@ def lines_of(
             was = before[kind][name]
             own = [key for key in SHOWN if key in table and table[key] != was.get(key)]
             keys = [f"{key} = {_shown(table[key])}" for key in own]
-            shown = f'"{name}"' if "." in name else name
-            yield f"[{kind}.{shown}] {', '.join(keys)}"
+            yield f"[{kind}.{toml_key(name)}] {', '.join(keys)}"
     if any(one.hypothesis.late for one in differences):
         yield f"[time] offset = {after['time']['offset']:.9g}"
 
@@ -115,11 +113,11 @@ def lines_of(
 def _shown(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
-    return f'"{value}"' if isinstance(value, str) else f"{value:.9g}"
+    return toml_text(value) if isinstance(value, str) else f"{value:.9g}"
 
 
 def write_corrected(
-    recording: Path, declared: Declared, differences: Sequence[Difference], path: Path
+    recording: Path, declared: Declared, differences: Sequence[ConventionDifference], path: Path
 ) -> list[Path]:
     """Write the corrected description, and beside it the table under the same name where the
     description has none of its own.
@@ -145,20 +143,13 @@ def write_corrected(
     if "model" in content:
         model = (description.parent / content["model"]).resolve()
         content["model"] = os.path.relpath(model, path.parent.resolve())
+    contents: dict[Path, str | bytes] = {path: tomli_w.dumps(content)}
     table = description.with_suffix(".csv")
-    files = [(path, tomli_w.dumps(content))]
-    written = [path]
     if table.exists():
-        written.append(path.with_suffix(".csv"))
+        contents[path.with_suffix(".csv")] = table.read_bytes()
     elif path.parent.resolve() != description.parent.resolve():
         where = f"expected a file in {description.parent}, where the log's files are"
         raise InputError(f"{path}: {where}")
-    for file in written:
-        if file.exists():
-            raise InputError(f"{file}: exists already; nothing is overwritten, name another file")
     path.parent.mkdir(parents=True, exist_ok=True)
-    for file, text in files:
-        file.write_text(text, encoding="utf-8")
-    if table.exists():
-        shutil.copyfile(table, path.with_suffix(".csv"))
-    return written
+    publish(contents)
+    return list(contents)

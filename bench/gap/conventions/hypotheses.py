@@ -17,7 +17,9 @@ import numpy as np
 
 from bench.gap.identify import listed
 from bench.gap.unit_check import UNITS, UNITS_IN_WORDS, Signal, Subject
+from bench.recordings.joint_order import least_order
 from sims.base import Array
+from sims.recording.lerobot_calibration import range_scale
 from sims.recording.recording import Recording, Run
 from sims.recording.turns import unwrapped
 
@@ -42,7 +44,7 @@ QUANTITIES = ("q", "qd", "tau")
 
 
 @dataclass(frozen=True)
-class Change:
+class SignalChange:
     """A signal of the model as a function of a recorded signal, in SI units.
 
     Attributes:
@@ -50,14 +52,14 @@ class Change:
         scale: factor.
         offset: added after the factor.
         unwrap: whether whole turns are restored first.
-        near: name of the command that tells which turn a position is in; empty without one.
+        command: name of the command that tells which turn a position is in; empty without one.
     """
 
     source: str
     scale: float = 1.0
     offset: float = 0.0
     unwrap: bool = False
-    near: str = ""
+    command: str = ""
 
     def applied(self, signals: Mapping[str, Array]) -> Array:
         """Return the signal (T,) that the model means.
@@ -67,24 +69,26 @@ class Change:
         """
         values = signals[self.source]
         if self.unwrap:
-            values = unwrapped(values, signals.get(self.near))
+            values = unwrapped(values, signals.get(self.command))
         return self.scale * values + self.offset
 
 
 @dataclass(frozen=True)
-class Hypothesis:
+class ConventionHypothesis:
     """A convention that may differ.
 
     Attributes:
         description: a sentence without its end.
         changes: the signals that differ, by the name that the model has for them.
-        unit: unit of the recorded numbers, where it differs from the stated one.
+        unit: unit of the recorded numbers, where it differs from the stated one alone.
+        has_free_offset: whether the offsets of all changes are one unknown angle.
         late: time by which commands are stamped late, s.
     """
 
     description: str
-    changes: Mapping[str, Change] = field(default_factory=dict)
+    changes: Mapping[str, SignalChange] = field(default_factory=dict)
     unit: str | None = None
+    has_free_offset: bool = False
     late: float = 0.0
 
     @property
@@ -123,7 +127,7 @@ class Hypothesis:
             offset=run.offset - self.late,
         )
 
-    def shifted(self, step: float) -> Hypothesis:
+    def shifted(self, step: float) -> ConventionHypothesis:
         """Return the hypothesis with its offsets changed by a step, rad."""
         changes = {
             name: replace(change, offset=change.offset + step)
@@ -133,7 +137,7 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
-class Joint:
+class JointSignals:
     """A joint and its recorded signals.
 
     Attributes:
@@ -153,7 +157,7 @@ class Joint:
     is_hinge: bool
 
 
-def recorded_joints(subject: Subject) -> list[Joint]:
+def recorded_joints(subject: Subject) -> list[JointSignals]:
     """Return the joints of a robot, in the order of its coordinates, with their signals."""
     kind: Any = subject.kind
     run = subject.recording.runs[0]
@@ -164,7 +168,7 @@ def recorded_joints(subject: Subject) -> list[Joint]:
         actuators = [a for a in kind.robot.actuators if a.joint == name]
         recorded = [a for a in actuators if f"u.{a.name}" in run.inputs]
         joints.append(
-            Joint(
+            JointSignals(
                 name=name,
                 channels={q: f"{q}.{name}" for q in QUANTITIES if f"{q}.{name}" in run.channels},
                 inputs=tuple(f"u.{a.name}" for a in recorded),
@@ -188,7 +192,9 @@ class HypothesisGenerator:
         self.joints = [joint for joint in recorded_joints(subject) if joint.channels]
         self._signals = {signal.name: signal for signal in subject.signals(channels)}
 
-    def generate(self, recording: Recording, suspects: Sequence[Joint]) -> Iterator[Hypothesis]:
+    def generate(
+        self, recording: Recording, suspects: Sequence[JointSignals]
+    ) -> Iterator[ConventionHypothesis]:
         """Yield hypotheses.
 
         Args:
@@ -209,7 +215,7 @@ class HypothesisGenerator:
             yield from self._normalised()
         yield from _late_commands(recording)
 
-    def _units_of_log(self, recording: Recording) -> Iterator[Hypothesis]:
+    def _units_of_log(self, recording: Recording) -> Iterator[ConventionHypothesis]:
         """Yield units that all signals of a kind may have."""
         positions = self._channels("q")
         commands = [name for joint in self.joints for name in joint.servo_inputs]
@@ -222,29 +228,27 @@ class HypothesisGenerator:
     def _channels(self, quantity: str) -> list[str]:
         return [joint.channels[quantity] for joint in self.joints if quantity in joint.channels]
 
-    def _normalised(self) -> Iterator[Hypothesis]:
+    def _normalised(self) -> Iterator[ConventionHypothesis]:
         """Yield positions and commands that are normalised to the range of each joint."""
         limited = [joint for joint in self.joints if joint.range and "q" in joint.channels]
         if not limited:
             return
         for low in (-NORMALISED_RANGE, 0.0):
-            changes: dict[str, Change] = {}
+            changes: dict[str, SignalChange] = {}
             for joint in limited:
                 assert joint.range is not None
-                lower, upper = joint.range
-                scale = (upper - lower) / (NORMALISED_RANGE - low)
+                scale = range_scale(*joint.range, from_zero=low == 0.0)
                 for name in (joint.channels["q"], *joint.servo_inputs):
-                    gain = self._signals[name].gain
-                    changes[name] = Change(name, scale / gain, lower - low * scale)
-            yield Hypothesis(
+                    gain = scale.gain / self._signals[name].gain
+                    changes[name] = SignalChange(name, gain, scale.offset)
+            yield ConventionHypothesis(
                 f"positions and commands look normalised to {low:g} to {NORMALISED_RANGE:g} over "
                 "the range of each joint",
                 changes,
-                unit="normalised",
             )
 
 
-def _signs(joint: Joint) -> Iterator[Hypothesis]:
+def _signs(joint: JointSignals) -> Iterator[ConventionHypothesis]:
     """Yield reversed signs: of position, command, both, velocity alone, torque alone."""
     positions = [joint.channels[q] for q in ("q", "qd") if q in joint.channels]
     groups = [positions, list(joint.inputs)]
@@ -253,14 +257,14 @@ def _signs(joint: Joint) -> Iterator[Hypothesis]:
     for names in groups:
         if names:
             text = f"the sign of {listed(names, MAX_NAMED)} looks reversed"
-            yield Hypothesis(text, {name: Change(name, -1.0) for name in names})
+            yield ConventionHypothesis(text, {name: SignalChange(name, -1.0) for name in names})
     if positions and joint.inputs:
         names = [*joint.channels.values(), *joint.inputs]
         text = f"the axis of joint {joint.name} looks reversed, command and position"
-        yield Hypothesis(text, {name: Change(name, -1.0) for name in names})
+        yield ConventionHypothesis(text, {name: SignalChange(name, -1.0) for name in names})
 
 
-def _zeros(joint: Joint, recording: Recording) -> Iterator[Hypothesis]:
+def _zeros(joint: JointSignals, recording: Recording) -> Iterator[ConventionHypothesis]:
     """Yield other zero positions: of the encoder, and of encoder and command."""
     position = joint.channels.get("q")
     if position is None or not joint.is_hinge:
@@ -274,14 +278,16 @@ def _zeros(joint: Joint, recording: Recording) -> Iterator[Hypothesis]:
         text = f"joint {joint.name} looks counted from another zero, command and position"
         for offset in ANGLES.tolist():
             names = (position, *joint.servo_inputs)
-            yield Hypothesis(text, {name: Change(name, 1.0, offset) for name in names})
+            changes = {name: SignalChange(name, 1.0, offset) for name in names}
+            yield ConventionHypothesis(text, changes, has_free_offset=True)
     text = f"position {position} looks counted from another zero"
     for offset in offsets:
         if abs(offset) > MIN_OFFSET:
-            yield Hypothesis(text, {position: Change(position, 1.0, offset)})
+            changes = {position: SignalChange(position, 1.0, offset)}
+            yield ConventionHypothesis(text, changes, has_free_offset=True)
 
 
-def _wraps(joints: Sequence[Joint], recording: Recording) -> Iterator[Hypothesis]:
+def _wraps(joints: Sequence[JointSignals], recording: Recording) -> Iterator[ConventionHypothesis]:
     """Yield positions that leave whole turns out."""
     for joint in joints:
         name = joint.channels.get("q")
@@ -289,9 +295,11 @@ def _wraps(joints: Sequence[Joint], recording: Recording) -> Iterator[Hypothesis
             continue
         jumps = [_largest_jump(run.channels[name]) for run in recording.training()]
         if max(jumps) > WRAP_JUMP:
-            near = joint.servo_inputs[0] if joint.servo_inputs else ""
+            command = joint.servo_inputs[0] if joint.servo_inputs else ""
             text = f"position {name} looks wrapped: whole turns are left out"
-            yield Hypothesis(text, {name: Change(name, unwrap=True, near=near)})
+            yield ConventionHypothesis(
+                text, {name: SignalChange(name, unwrap=True, command=command)}
+            )
 
 
 def _largest_jump(values: Array) -> float:
@@ -300,8 +308,8 @@ def _largest_jump(values: Array) -> float:
 
 
 def _orders(
-    joints: Sequence[Joint], recording: Recording, suspects: Sequence[Joint]
-) -> Iterator[Hypothesis]:
+    joints: Sequence[JointSignals], recording: Recording, suspects: Sequence[JointSignals]
+) -> Iterator[ConventionHypothesis]:
     """Yield other orders of the joints: of channels, of commands, and of both.
 
     Pairs of suspects are exchanged; whole orders are the alphabetical one, the reversed one, and
@@ -310,7 +318,8 @@ def _orders(
     numbers = range(len(joints))
     has_commands = all(len(joint.inputs) == 1 for joint in joints)
     quantities = [q for q in QUANTITIES if all(q in joint.channels for joint in joints)]
-    orders = [{a: b, b: a} for a, b in combinations(numbers, 2) if _are(joints, (a, b), suspects)]
+    places = [i for i in numbers if joints[i] in suspects]
+    orders = [{a: b, b: a} for a, b in combinations(places, 2)]
     alphabetical = sorted(numbers, key=lambda i: joints[i].name)
     orders += [
         {i: alphabetical.index(i) for i in numbers},
@@ -325,41 +334,35 @@ def _orders(
             continue
         names = listed([joints[a].name for a in sorted(moved)], MAX_NAMED)
         channels = {
-            joints[a].channels[q]: Change(joints[b].channels[q])
+            joints[a].channels[q]: SignalChange(joints[b].channels[q])
             for a, b in moved.items()
             for q in quantities
         }
         if channels:
-            yield Hypothesis(f"the channels of {names} look exchanged", channels)
+            yield ConventionHypothesis(f"the channels of {names} look exchanged", channels)
         if not has_commands:
             continue
-        commands = {joints[a].inputs[0]: Change(joints[b].inputs[0]) for a, b in moved.items()}
-        yield Hypothesis(f"the commands of {names} look exchanged", commands)
+        commands = {
+            joints[a].inputs[0]: SignalChange(joints[b].inputs[0]) for a, b in moved.items()
+        }
+        yield ConventionHypothesis(f"the commands of {names} look exchanged", commands)
         if channels:
             text = f"the channels and commands of {names} look exchanged"
-            yield Hypothesis(text, {**channels, **commands})
+            yield ConventionHypothesis(text, {**channels, **commands})
 
 
-def _are(joints: Sequence[Joint], numbers: Sequence[int], suspects: Sequence[Joint]) -> bool:
-    return all(joints[i] in suspects for i in numbers)
-
-
-def _order_of_commands(joints: Sequence[Joint], recording: Recording) -> dict[int, int]:
+def _order_of_commands(joints: Sequence[JointSignals], recording: Recording) -> dict[int, int]:
     """Return the order of positions that follows the commands best, by linear assignment."""
-    # SciPy's optimisers are slow to import.
-    from scipy.optimize import linear_sum_assignment
-
     count = len(joints)
     costs = np.zeros((count, count))
     for run in recording.training():
         for a, b in np.ndindex(count, count):
             difference = run.channels[joints[b].channels["q"]] - run.inputs[joints[a].inputs[0]]
             costs[a, b] += float(np.nanvar(difference))
-    rows, columns = linear_sum_assignment(costs)
-    return dict(zip(rows.tolist(), columns.tolist(), strict=True))
+    return dict(enumerate(least_order(costs)))
 
 
-def _units(signals: Sequence[Signal], recording: Recording) -> Iterator[Hypothesis]:
+def _units(signals: Sequence[Signal], recording: Recording) -> Iterator[ConventionHypothesis]:
     """Yield other units of signals that share one, and ticks where all numbers are whole."""
     first = signals[0]
     names = [signal.name for signal in signals]
@@ -368,9 +371,9 @@ def _units(signals: Sequence[Signal], recording: Recording) -> Iterator[Hypothes
         scale = first.scale * gain / first.gain
         if not math.isclose(scale, 1.0, rel_tol=1e-6):
             words, stated = (UNITS_IN_WORDS.get(one, one) for one in (unit, first.stated))
-            yield Hypothesis(
+            yield ConventionHypothesis(
                 f"the numbers of {text} look like {words}, stated as {stated}",
-                {name: Change(name, scale) for name in names},
+                {name: SignalChange(name, scale) for name in names},
                 unit=unit,
             )
     if first.si != "rad" or not _are_whole(signals, recording):
@@ -378,10 +381,9 @@ def _units(signals: Sequence[Signal], recording: Recording) -> Iterator[Hypothes
     for ticks in TICKS_PER_TURN:
         scale = 2.0 * math.pi / ticks / first.gain
         for zero in (0.0, math.pi):
-            yield Hypothesis(
+            yield ConventionHypothesis(
                 f"the numbers of {text} look like ticks, {ticks:g} a turn",
-                {name: Change(name, scale, -zero) for name in names},
-                unit="ticks",
+                {name: SignalChange(name, scale, -zero) for name in names},
             )
 
 
@@ -397,7 +399,7 @@ def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
     return True
 
 
-def _late_commands(recording: Recording) -> Iterator[Hypothesis]:
+def _late_commands(recording: Recording) -> Iterator[ConventionHypothesis]:
     """Yield commands that are stamped late, so that the robot answers before them."""
     run = recording.runs[0]
     if not run.inputs or run.times.size < 2:
@@ -406,4 +408,4 @@ def _late_commands(recording: Recording) -> Iterator[Hypothesis]:
     for count in LATE_SAMPLES:
         late = count * interval
         text = f"commands look stamped {late:.4g} s late: the robot answers before them"
-        yield Hypothesis(text, late=late)
+        yield ConventionHypothesis(text, late=late)

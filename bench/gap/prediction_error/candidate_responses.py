@@ -212,11 +212,13 @@ class FollowedRuns:
         typical: Array,
     ) -> FollowedRuns:
         """Filter the linearised models of all runs; other arguments as those of `_fit_noise`."""
-        maps = [one.interval_maps() for one in linear]
-        # An effect may have states of its own.
-        prior = _prior(world, linear, maps[0].states.shape[1])
-        runs = LinearRuns.stacked(maps, world.observed, prior)
-        fitted = _fit_noise(runs, noise, force, typical)
+        # A model that diverges between two samples exceeds all numbers: its filter is not sound.
+        with np.errstate(all="ignore"):
+            maps = [one.interval_maps() for one in linear]
+            # An effect may have states of its own.
+            prior = _prior(world, linear, maps[0].states.shape[1])
+            runs = LinearRuns.stacked(maps, world.observed, prior)
+            fitted = _fit_noise(runs, noise, force, typical)
         return cls(world, theta, linear=linear, runs=runs, typical=typical, **fitted._asdict())
 
     @classmethod

@@ -45,6 +45,10 @@ def check_selection(context: SearchContext, selected: Selected) -> None:
     filters = context.filters
     if filters.is_soft or not filters.base.lacks_force:
         return
+    friction = dry_friction_of(context, selected)
+    # Stiff friction that explains the runs is not compared.
+    if friction.effects and is_explained(context, context.search.fit_one(friction)):
+        return
     kept = without_surplus(context, selected)
     own = filters.log_likelihood(context.columns.start(kept.groups, kept.coefficients).theta)
     check_filter(context, own, is_preliminary=True)
@@ -90,6 +94,9 @@ def fit_dry_friction(context: SearchContext, selected: Selected) -> Model:
     friction = dry_friction_of(context, selected)
     if not friction.effects or not selected.followed.lacks_force:
         return context.search.base
+    known = context.search.models.get(frozenset(friction.effects))
+    if known is not None and is_explained(context, known):
+        return without_idle_effects(context, known)
     found = fit(context, friction)
     return without_idle_effects(context, found) if is_explained(context, found) else found
 

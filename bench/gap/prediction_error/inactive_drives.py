@@ -9,17 +9,18 @@ and the force that holds the joint still, g. Three hypotheses leave
     on: f - τ,        off: f,        held (by a brake): f - g                                    (1)
 
 A sequence of hypotheses with few changes follows by dynamic programming (A. J. Viterbi 1967,
-doi:10.1109/TIT.1967.1054010), with the cost min(|e| / s, `LARGEST`) of a sample, s the median of
-the smallest of (1), and `CHANGE` for each change. A stretch that is off or held stands only if
+doi:10.1109/TIT.1967.1054010). A sample costs min(|e| / s, `MAX_SAMPLE_COST`), with s the median of
+the smallest of (1), and each change costs `CHANGE_COST`. A stretch that is off or held is accepted
+only if
 
-* what the model's drive misses there is `WORSE` times what it misses elsewhere: a gain, a friction
-  or a dead zone that is wrong is wrong everywhere;
-* its hypothesis leaves `LEFT` of that, and `LEFT` of what the drive exerts elsewhere: a drive at
-  its force limit exerts more than elsewhere;
-* there are no more than `MOST` of them in a run.
+* the force that the model's drive misses there is `MIN_MISSED_RATIO` times that elsewhere: a wrong
+  gain, friction or dead zone is wrong everywhere;
+* its hypothesis leaves at most `MAX_RESIDUAL_SHARE` of that force, and of what the drive exerts
+  elsewhere: a drive at its force limit exerts more than elsewhere;
+* there are at most `MAX_STRETCHES` of them in a run.
 
-Sizes are the quantile `TYPICAL` of magnitudes over all such stretches of a joint. Among 500 random
-effects of the library at an arm with motors or servos, four were taken for a drive that does
+Magnitudes are the quantile `MAGNITUDE_QUANTILE` over all such stretches of a joint. Among 500
+random effects of the library at an arm with motors or servos, four were taken for a drive that does
 nothing.
 
 All drives are held at once, up to the end of a run or from its beginning, and the first two
@@ -47,40 +48,43 @@ from sims.recording.drive_switches import (
 )
 from sims.recording.recording import Recording, Run
 from sims.robot.activation_filters import activation_filters
+from sims.robot.inverse_dynamics import motion_forces
 from sims.robot.model import Robot
 
 Mask = NDArray[np.bool_]
 
 ON, OFF, HELD = 0, 1, 2
 """Numbers of the hypotheses."""
-LARGEST = 8.0
-"""Largest cost of a sample, so that single samples decide nothing."""
-CHANGE = 40.0
+MAX_SAMPLE_COST = 8.0
+"""Maximum cost of a sample, so that single samples decide nothing."""
+CHANGE_COST = 40.0
 """Cost of a change from one hypothesis to another."""
-AS_GOOD = 0.5
-"""Share of `CHANGE` that a column may cost more than the likeliest stretches, for each change."""
-TYPICAL = 0.8
-"""Quantile of magnitudes that is compared."""
-WORSE = 2.0
-"""Factor by which a drive that does nothing makes the model miss more."""
-LEFT = 0.4
-"""Share that a hypothesis leaves at most."""
-BETTER = 0.6
-"""The same of a single stretch."""
-SLOW = 0.1
-"""Share of its usual velocity below which a joint that is held stands still."""
-MOST = 3
+MAX_EXTRA_COST = 0.5
+"""Share of `CHANGE_COST` by which a column may exceed the cost of the likeliest stretches, for each
+change.
+"""
+MAGNITUDE_QUANTILE = 0.8
+"""Quantile by which magnitudes are compared."""
+MIN_MISSED_RATIO = 2.0
+"""Minimum ratio of the force that the model misses within the stretches to that elsewhere."""
+MAX_RESIDUAL_SHARE = 0.4
+"""Maximum share of a force that a hypothesis may leave unexplained over all stretches."""
+MAX_STRETCH_SHARE = 0.6
+"""Maximum share that a hypothesis may leave unexplained in a single stretch."""
+MAX_STILL_SPEED = 0.1
+"""Maximum velocity of a joint that is held, as a share of its usual velocity."""
+MAX_STRETCHES = 3
 """Maximum number of stretches of a run."""
-SHORTEST = 20
+MIN_SAMPLES = 20
 """Minimum number of samples of a stretch, and of those in which a drive works."""
-EDGE = 5
+EDGE_SAMPLES = 5
 """Number of samples on either side of a change in which the smoothed motion does not tell when it
 was.
 """
-MOST_SAMPLES = 20_000
+MAX_SAMPLES = 20_000
 """Maximum number of samples at which forces are computed."""
-SMALLEST_SCALE = 1e-3
-"""Smallest s, as a share of the force that the motion needs."""
+MIN_SCALE_SHARE = 1e-3
+"""Minimum of s, as a share of the force that the motion needs."""
 
 
 class JointForces(NamedTuple):
@@ -135,10 +139,10 @@ class InactiveDrive:
             given = np.where(mask[:: self.every], costs[1], costs[0])
             likeliest = np.where(own[:: self.every], costs[1], costs[0])
             more += float((given - likeliest).sum())
-            if len(spans(mask)) > MOST:
+            if len(spans(mask)) > MAX_STRETCHES:
                 return False
             changes += int((mask[1:] != mask[:-1]).sum())
-        return more <= AS_GOOD * CHANGE * max(changes, 1)
+        return more <= MAX_EXTRA_COST * CHANGE_COST * max(changes, 1)
 
 
 def without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
@@ -229,7 +233,7 @@ def _changing_column(recording: Recording, drives: Sequence[InactiveDrive]) -> s
 
 def _widened(mask: Mask) -> Mask:
     """A mask with some samples more on either side."""
-    wide: Mask = np.convolve(mask, np.ones(2 * EDGE + 1), mode="same") > 0.5
+    wide: Mask = np.convolve(mask, np.ones(2 * EDGE_SAMPLES + 1), mode="same") > 0.5
     return wide
 
 
@@ -248,7 +252,7 @@ def inactive_drives(recording: Recording, kind: type[Simulator]) -> list[Inactiv
     if not kind.has_model or robot is None or not _is_open_chain(robot, recording):
         return []
     total = sum(run.times.size for run in recording.runs)
-    every = -(-total // MOST_SAMPLES)
+    every = -(-total // MAX_SAMPLES)
     with np.errstate(all="ignore"):
         forces = [_forces(robot, recording, run) for run in _thinned(recording, every)]
     driven = [a for a in robot.actuators if a.joint is not None and a.kind != "other"]
@@ -285,7 +289,7 @@ def _is_open_chain(robot: Robot, recording: Recording) -> bool:
     """Whether forces follow from the recorded positions."""
     recorded = recording.runs[0].channels
     singles = all(joint.single and f"q.{joint.name}" in recorded for joint in robot.joints)
-    long = all(run.times.size > 3 * SHORTEST for run in recording.runs)
+    long = all(run.times.size > 3 * MIN_SAMPLES for run in recording.runs)
     return singles and long and not robot.compiled.neq and bool(robot.actuators)
 
 
@@ -296,41 +300,25 @@ def _thinned(recording: Recording, every: int) -> list[Run]:
 
 def _forces(robot: Robot, recording: Recording, run: Run) -> JointForces:
     """Compute the forces of (1) by MuJoCo's inverse dynamics."""
-    import mujoco
-
     model = robot.compiled
-    data = mujoco.MjData(model)
     states = np.stack(track_joints(run.times, _readings(robot, recording, run)))
-    positions = [joint.position for joint in robot.joints]
-    dofs = [joint.velocity for joint in robot.joints]
+    motion = np.transpose(states, (2, 1, 0))
+    still = np.stack([motion[0], np.zeros_like(motion[0]), np.zeros_like(motion[0])])
     controls, activations = _controls(robot, run)
-    applied = np.zeros((run.times.size, model.nv))
-    for joint in robot.joints:
+    applied = np.zeros(motion.shape[1:])
+    for column, joint in enumerate(robot.joints):
         name = f"force.{joint.name}"
         if name in run.inputs:
-            applied[:, joint.velocity] = _about(run, name)
-    shape = run.times.size, len(dofs)
-    needed, driven, holding = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    for k in range(run.times.size):
-        data.qpos[positions] = states[:, k, 0]
-        data.qvel[:], data.qacc[:] = 0.0, 0.0
-        mujoco.mj_inverse(model, data)
-        holding[k] = data.qfrc_inverse[dofs] - applied[k, dofs]
-        data.qvel[dofs] = states[:, k, 1]
-        data.qacc[dofs] = states[:, k, 2]
-        mujoco.mj_inverse(model, data)
-        needed[k] = data.qfrc_inverse[dofs] - applied[k, dofs]
-        data.ctrl[:] = controls[k]
-        data.act[:] = activations[k]
-        mujoco.mj_fwdActuation(model, data)
-        driven[k] = data.qfrc_actuator[dofs]
+            applied[:, column] = _mean_input(run, name)
+    needed, driven = motion_forces(model, robot.joints, motion, controls, activations)
+    holding, _ = motion_forces(model, robot.joints, still, controls, activations)
     names = [joint.name for joint in robot.joints]
     for name, off in run.off.items():
         of = robot.actuator(name).joint
         if of is not None:
             # Where it is known to be off, both hypotheses agree.
             driven[off, names.index(of)] = 0.0
-    return JointForces(needed, driven, holding, states[:, :, 1].T)
+    return JointForces(needed - applied, driven, holding - applied, motion[1])
 
 
 def _readings(robot: Robot, recording: Recording, run: Run) -> list[tuple[Array, Array]]:
@@ -349,7 +337,7 @@ def _readings(robot: Robot, recording: Recording, run: Run) -> list[tuple[Array,
     return readings
 
 
-def _about(run: Run, name: str) -> Array:
+def _mean_input(run: Run, name: str) -> Array:
     """(T,) an input about each sample: the mean of what it was until then and is from then on."""
     values = run.inputs[name]
     if name in run.linear:
@@ -367,7 +355,7 @@ def _controls(robot: Robot, run: Run) -> tuple[Array, Array]:
     for actuator in robot.actuators:
         name = f"u.{actuator.name}"
         if name in run.inputs:
-            controls[:, actuator.control] = _about(run, name)
+            controls[:, actuator.control] = _mean_input(run, name)
     steps = np.diff(run.times)
     for one in activation_filters(robot):
         taken = one.clipped(controls[:, one.actuator.control])
@@ -400,34 +388,37 @@ class _Stretches:
         for of_runs in self._residuals:
             for cost, more in zip(self.costs, _costs(of_runs, state), strict=True):
                 cost += more
-        masks = [_long(_likeliest(cost)) for cost in self.costs]
-        if max(len(spans(mask)) for mask in masks) > MOST:
+        masks = [_without_short_stretches(_likeliest(cost)) for cost in self.costs]
+        if max(len(spans(mask)) for mask in masks) > MAX_STRETCHES:
             masks = [np.zeros_like(mask) for mask in masks]
-        self.masks = self._standing(masks)
+        self.masks = self._accepted(masks)
 
     def any(self) -> bool:
         """Whether there is one."""
         return any(mask.any() for mask in self.masks)
 
-    def _standing(self, masks: Sequence[Mask]) -> list[Mask]:
+    def _accepted(self, masks: Sequence[Mask]) -> list[Mask]:
         """Return masks (T,) if they fulfil the conditions above, without single stretches that do
         not; else empty ones.
         """
         nothing = [np.zeros_like(mask) for mask in masks]
         working = [~_widened(mask) for mask in masks]
-        inner = [_inner(mask) for mask in masks]
-        if min(sum(int(m.sum()) for m in of_runs) for of_runs in (working, inner)) < SHORTEST // 2:
+        inner = [_without_edges(mask) for mask in masks]
+        if (
+            min(sum(int(m.sum()) for m in of_runs) for of_runs in (working, inner))
+            < MIN_SAMPLES // 2
+        ):
             return nothing
-        missed = self._sizes(ON, working)
-        usual = self._sizes(self.state, working)
-        driven = self._sizes(ON, inner)
-        left = self._sizes(self.state, inner)
-        is_worse = any(d >= WORSE * m for d, m in zip(driven, missed, strict=True))
-        is_small = all(e <= LEFT * u for e, u in zip(left, usual, strict=True))
-        if not (is_worse and is_small and sum(left) <= LEFT * sum(driven)):
+        missed = self._magnitudes(ON, working)
+        usual = self._magnitudes(self.state, working)
+        driven = self._magnitudes(ON, inner)
+        left = self._magnitudes(self.state, inner)
+        is_worse = any(d >= MIN_MISSED_RATIO * m for d, m in zip(driven, missed, strict=True))
+        is_small = all(e <= MAX_RESIDUAL_SHARE * u for e, u in zip(left, usual, strict=True))
+        if not (is_worse and is_small and sum(left) <= MAX_RESIDUAL_SHARE * sum(driven)):
             return nothing
         fast = [
-            _size(np.concatenate([f.velocity[m, j] for f, m in self._with(working)]))
+            _magnitude(np.concatenate([f.velocity[m, j] for f, m in self._paired(working)]))
             for j in self._joints
         ]
         result = []
@@ -436,39 +427,42 @@ class _Stretches:
             for first, end in spans(mask):
                 own = [np.zeros_like(m) for m in masks]
                 own[run][first:end] = within[first:end]
-                better = sum(self._sizes(self.state, own)) <= BETTER * sum(self._sizes(ON, own))
+                better = sum(self._magnitudes(self.state, own)) <= MAX_STRETCH_SHARE * sum(
+                    self._magnitudes(ON, own)
+                )
                 standing[first:end] = better and (
                     self.state == OFF or self._is_still(run, own[run], (first, end), fast)
                 )
             result.append(standing)
         return result
 
-    def _with(self, masks: Sequence[Mask]) -> zip[tuple[JointForces, Mask]]:
+    def _paired(self, masks: Sequence[Mask]) -> zip[tuple[JointForces, Mask]]:
         """Pair forces of runs with masks."""
         return zip(self._forces, masks, strict=True)
 
-    def _sizes(self, state: int, masks: Sequence[Mask]) -> list[float]:
+    def _magnitudes(self, state: int, masks: Sequence[Mask]) -> list[float]:
         """Return how large the residuals of a hypothesis are in masks (T,), by joint."""
         return [
-            _size(np.concatenate([r[state, m] for r, m in zip(of_runs, masks, strict=True)]))
+            _magnitude(np.concatenate([r[state, m] for r, m in zip(of_runs, masks, strict=True)]))
             for of_runs in self._residuals
         ]
 
     def _is_still(self, run: int, mask: Mask, ends: tuple[int, int], fast: Sequence[float]) -> bool:
         """Whether all joints stand still in a stretch, at an end of the run."""
         velocity = self._forces[run].velocity
-        at_end = ends[0] <= EDGE or ends[1] >= mask.size - EDGE
+        at_end = ends[0] <= EDGE_SAMPLES or ends[1] >= mask.size - EDGE_SAMPLES
         still = [
-            _size(velocity[mask, j]) <= SLOW * f for j, f in zip(self._joints, fast, strict=True)
+            _magnitude(velocity[mask, j]) <= MAX_STILL_SPEED * f
+            for j, f in zip(self._joints, fast, strict=True)
         ]
         return at_end and all(still)
 
 
-def _inner(mask: Mask) -> Mask:
+def _without_edges(mask: Mask) -> Mask:
     """A mask without the samples beside changes, where the smoothed motion is blurred."""
     result = np.zeros_like(mask)
     for first, end in spans(mask):
-        result[first + EDGE * (first > 0) : end - EDGE * (end < mask.size)] = True
+        result[first + EDGE_SAMPLES * (first > 0) : end - EDGE_SAMPLES * (end < mask.size)] = True
     return result
 
 
@@ -480,11 +474,13 @@ def _costs(residuals: Sequence[Array], state: int) -> list[Array]:
     if not pooled.size:
         return [np.zeros((2, r.shape[1])) for r in residuals]
     scale = float(np.median(np.abs(pooled).min(axis=0)))
-    scale = max(scale, SMALLEST_SCALE * _size(pooled[1]))
+    scale = max(scale, MIN_SCALE_SHARE * _magnitude(pooled[1]))
     if not scale > 0:
         return [np.zeros((2, r.shape[1])) for r in residuals]
     return [
-        np.minimum(np.abs(np.nan_to_num(r[chosen], nan=LARGEST * scale)) / scale, LARGEST)
+        np.minimum(
+            np.abs(np.nan_to_num(r[chosen], nan=MAX_SAMPLE_COST * scale)) / scale, MAX_SAMPLE_COST
+        )
         for r in residuals
     ]
 
@@ -497,7 +493,7 @@ def _likeliest(costs: Array) -> Mask:
     from_other = np.zeros((2, count), dtype=bool)
     best = costs[:, 0].copy()
     for k in range(1, count):
-        changed = best[::-1] + CHANGE
+        changed = best[::-1] + CHANGE_COST
         from_other[:, k] = changed < best
         best = np.minimum(best, changed) + costs[:, k]
     result = np.zeros(count, dtype=bool)
@@ -509,17 +505,17 @@ def _likeliest(costs: Array) -> Mask:
     return result
 
 
-def _long(mask: Mask) -> Mask:
+def _without_short_stretches(mask: Mask) -> Mask:
     """A mask without stretches that are too short."""
     result = np.zeros_like(mask)
     for first, end in spans(mask):
-        result[first:end] = end - first >= SHORTEST
+        result[first:end] = end - first >= MIN_SAMPLES
     return result
 
 
-def _size(values: Array) -> float:
+def _magnitude(values: Array) -> float:
     """A quantile of magnitudes (n,): impacts, of which the smoothed motion knows little, are
     beyond it.
     """
     finite = np.abs(values[np.isfinite(values)])
-    return float(np.quantile(finite, TYPICAL)) if finite.size else 0.0
+    return float(np.quantile(finite, MAGNITUDE_QUANTILE)) if finite.size else 0.0

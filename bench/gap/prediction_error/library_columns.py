@@ -112,13 +112,7 @@ class LibraryColumns:
         """Return the coefficients (k,) of an effect that a group of columns with a solution of the
         regression means.
         """
-        probes = self.library.probes
-        c = probes[group.columns[0]].c.copy()
-        for column, value in zip(group.columns, solution, strict=True):
-            # A fixed change is that of this very size.
-            if not probes[column].fixed:
-                c[probes[column].place] = value
-        return clip_coefficients(self.filters.world, group.effect, c)
+        return group_coefficients(self.filters.world, self.library.probes, group, solution)
 
     def regression(self, model: Model) -> ModelRegression:
         """Return the regression with a fitted model's effects in the model; candidates are the
@@ -149,6 +143,26 @@ class LibraryColumns:
             places += world.places(name)
             first += 1 + len(moved)
         return Known(np.array(places, dtype=np.intp), np.stack(derivatives, axis=-1))
+
+
+def group_coefficients(
+    world: World, probes: Sequence[Probe], group: Group, solution: Array
+) -> Array:
+    """Return the coefficients (k,) of an effect that a group of columns with a solution of the
+    regression means, within their bounds.
+
+    Args:
+        world: the runs.
+        probes: of all columns.
+        group: columns of the effect.
+        solution: coefficients of these columns.
+    """
+    c = probes[group.columns[0]].c.copy()
+    for column, value in zip(group.columns, solution, strict=True):
+        # A fixed change is that of this very size.
+        if not probes[column].fixed:
+            c[probes[column].place] = value
+    return clip_coefficients(world, group.effect, c)
 
 
 def regression_about(

@@ -174,17 +174,11 @@ class ModelFilters:
         """The likeliest model of dry friction in MuJoCo's soft form at the joint where most is
         missing, by filters; None where the library has none.
         """
-        followed = self.base
-        joint = followed.joints_by_loss[0]
-        name = f"friction.coulomb@{joint_name(self.world, joint)}"
-        if self.is_soft or name not in self.world.library:
+        models = soft_friction_models(self.base, self.reference)
+        if not models:
             return None
-        starts = []
-        for factor in SOFT_FACTORS:
-            # A joint that slides lacks about the force of its friction.
-            size = np.array([factor * float(followed.force[joint])])
-            theta = self.theta_with(name, clip_coefficients(self.world, name, size))
-            starts.append(Start((name,), theta, self.first_states(followed)))
+        states = self.first_states(self.base)
+        starts = [Start((name,), theta, states) for name, theta in models]
         return max(starts, key=lambda start: self.log_likelihood(start.theta, is_soft=True))
 
     @cached_property
@@ -193,3 +187,29 @@ class ModelFilters:
         simulator = self.world.simulator_of(soft_kind(self.world.kind))
         assert isinstance(simulator, RobotSimulator)
         return simulator
+
+
+def soft_friction_models(followed: FollowedRuns, theta: Array) -> list[tuple[str, Array]]:
+    """Return models with dry friction at the joint where most force is missing, of some sizes, that
+    a simulator with MuJoCo's soft form is to follow; none where the library has no such effect, or
+    friction is soft already.
+
+    Args:
+        followed: the runs, without the effect.
+        theta: (P,) parameters without it.
+
+    Returns:
+        The effect and the parameters (P,) of each model.
+    """
+    world, joint = followed.world, followed.joints_by_loss[0]
+    name = f"friction.coulomb@{joint_name(world, joint)}"
+    if has_soft_form(world) or name not in world.library:
+        return []
+    models = []
+    for factor in SOFT_FACTORS:
+        # A joint that slides lacks about the force of its friction.
+        size = np.array([factor * float(followed.force[joint])])
+        changed = theta.copy()
+        changed[world.slots[name]] = clip_coefficients(world, name, size)
+        models.append((name, changed))
+    return models

@@ -1,0 +1,58 @@
+"""Forces at a robot's joints by MuJoCo's inverse dynamics along a measured motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sims.base import Array
+from sims.robot.model import Joint
+
+
+class MotionForces(NamedTuple):
+    """Forces at J joints at T instants, (T, J) each.
+
+    Attributes:
+        needed: what the motion needs beside gravity and passive forces.
+        driven: what the actuators of the model exert.
+    """
+
+    needed: Array
+    driven: Array
+
+
+def motion_forces(
+    model: Any,
+    joints: Sequence[Joint],
+    motion: Array,
+    controls: Array,
+    activations: Array | None = None,
+) -> MotionForces:
+    """Compute the forces of a motion by inverse dynamics; other joints rest where the model has
+    them.
+
+    Args:
+        model: compiled model of MuJoCo.
+        joints: J joints with one coordinate each.
+        motion: (3, T, J) their positions, velocities and accelerations.
+        controls: (T, nu) controls of all actuators.
+        activations: (T, na) activations of all actuators; zero if None.
+    """
+    import mujoco
+
+    data = mujoco.MjData(model)
+    positions = [joint.position for joint in joints]
+    dofs = [joint.velocity for joint in joints]
+    needed, driven = np.zeros(motion.shape[1:]), np.zeros(motion.shape[1:])
+    for k in range(motion.shape[1]):
+        data.qpos[positions], data.qvel[dofs], data.qacc[dofs] = motion[:, k]
+        mujoco.mj_inverse(model, data)
+        needed[k] = data.qfrc_inverse[dofs]
+        data.ctrl[:] = controls[k]
+        if activations is not None:
+            data.act[:] = activations[k]
+        mujoco.mj_fwdActuation(model, data)
+        driven[k] = data.qfrc_actuator[dofs]
+    return MotionForces(needed, driven)
