@@ -1,8 +1,8 @@
-"""How commands answer: in words for a person, or with ``--json`` in one document for a program.
+"""Print the results of commands, as text or with ``--json`` as one JSON document.
 
-A command is a function of its options and of `say`, which takes a line for a person as it comes,
-and returns an `Answer`, which holds the same for a program. One of the two printers here prints the
-one or the other; so every command has ``--json``, and faults have one form.
+A command is a function of its options and of `say`, which prints one line of text at once. It
+returns an `Answer`, which contains the same information as JSON. One of the two printers here
+prints either the one or the other; so every command has ``--json``, and errors have one form.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from pathlib import PurePath
 from typing import Any, Literal, NamedTuple, Protocol
 
 Document = dict[str, Any]
-"""What JSON can hold, once `plain` has seen it."""
+"""Data that can be written as JSON after conversion by `plain`."""
 Say = Callable[[str], None]
-"""Takes a line for a person."""
+"""Prints a line of text."""
 FaultKind = Literal["usage", "input", "memory", "interrupted", "internal"]
 
 DONE = 0
-"""Exit code of a command that did what was asked."""
+"""Exit code of a command that succeeded."""
 WRONG = 1
-"""Of one that did, and something in it is not as it should be."""
+"""Exit code of a command that completed but found a problem."""
 FAULT = 2
-"""Of one that could not begin, or go on."""
+"""Exit code of a command that could not begin or continue."""
 INTERRUPTED = 130
-"""Of one that a person interrupted, as shells have it."""
+"""Exit code of a command that was interrupted, by the convention of shells."""
 EXITS = {
     DONE: "done",
     WRONG: "done, and something failed in it: a run, a check, a claim; or what was asked to make "
@@ -37,15 +37,15 @@ EXITS = {
     FAULT: "a fault of the input, told in one line; nothing was half-written",
     INTERRUPTED: "interrupted; what was finished is kept",
 }
-"""Every exit code that there is."""
+"""Meaning of every exit code."""
 
 
 class Answer(NamedTuple):
-    """What a command has to say to a program.
+    """Result of a command for a program.
 
     Attributes:
-        document: as the schema of the command's name has it (`simgap schema NAME`).
-        code: with which the program ends, one of `EXITS`.
+        document: JSON document by the schema of the command's name (`simgap schema NAME`).
+        code: Exit code of the program, one of `EXITS`.
     """
 
     document: Document
@@ -53,52 +53,58 @@ class Answer(NamedTuple):
 
 
 class Printer(Protocol):
-    """Prints what commands answer."""
+    """Prints the results of commands."""
 
     def say(self, line: str) -> None:
-        """Take a line for a person."""
+        """Print a line of text."""
         ...
 
     def working(self) -> AbstractContextManager[None]:
-        """Around the command at work."""
+        """Return the context in which the command runs."""
         ...
 
     def answer(self, answer: Answer) -> None:
-        """Print what it has come to."""
+        """Print the result of the command."""
         ...
 
     def fault(self, kind: FaultKind, message: str, code: int) -> None:
-        """Print why it came to nothing."""
+        """Print why the command failed.
+
+        Args:
+            kind: Kind of the error.
+            message: One line.
+            code: Exit code of the program.
+        """
         ...
 
 
 class Words:
-    """For a person: every line as it comes."""
+    """Prints for a person: every line at once."""
 
     def say(self, line: str) -> None:
-        """Print it."""
+        """Print the line."""
         print(line)
 
     def working(self) -> AbstractContextManager[None]:
-        """Nothing is to be kept from anywhere."""
+        """Return a context that changes nothing."""
         return nullcontext()
 
     def answer(self, answer: Answer) -> None:
-        """All of it has been said."""
+        """Print nothing: all lines have been printed before."""
 
     def fault(self, kind: FaultKind, message: str, code: int) -> None:  # noqa: ARG002
-        """One line on stderr; the traceback of what is internal says more."""
+        """Print one line on stderr, except for internal errors, which have a traceback."""
         _warn(kind, message)
 
 
 class Json:
-    """For a program: one document on stdout, and nothing else there."""
+    """Prints for a program: one JSON document on stdout, and nothing else there."""
 
     def say(self, line: str) -> None:
-        """The document has it too."""
+        """Ignore the line: the document contains its information."""
 
     def working(self) -> AbstractContextManager[None]:
-        """Whatever is printed meanwhile goes to stderr."""
+        """Return a context that redirects all output to stderr."""
         return _stdout_to_stderr()
 
     def answer(self, answer: Answer) -> None:
@@ -106,7 +112,7 @@ class Json:
         print(text(answer.document))
 
     def fault(self, kind: FaultKind, message: str, code: int) -> None:
-        """Print it in the form of every command; a log of stderr has its line too."""
+        """Print the error as JSON, and as a line on stderr for logs."""
         _warn(kind, message)
         print(text({"error": {"kind": kind, "message": message, "code": code}}))
 
@@ -117,30 +123,30 @@ def _warn(kind: FaultKind, message: str) -> None:
 
 
 def text(document: Document) -> str:
-    """A document as JSON, laid out so that a person can look at it too."""
+    """Format a document as indented JSON."""
     return json.dumps(plain(document), indent=1, allow_nan=False, ensure_ascii=False)
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON has it: paths as texts, tuples as lists, no number for what is not finite."""
+    """Convert a value to JSON types: paths to text, tuples to lists, NaN and infinity to None."""
     if isinstance(value, Mapping):
         return {str(key): plain(inner) for key, inner in value.items()}
     if isinstance(value, tuple | list | set | frozenset):
         return [plain(inner) for inner in value]
     if isinstance(value, PurePath):
         return str(value)
-    # Of numpy, whether a number or an array of them.
+    # NumPy numbers and arrays have this method.
     if hasattr(value, "tolist"):
         return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    # What a file or a system call gave may hold half a character, which no encoder takes.
+    # Text from files or system calls may contain lone surrogates, which cannot be encoded.
     return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
 
 
 @contextmanager
 def _stdout_to_stderr() -> Iterator[None]:
-    """Send to stderr what is printed: by Python, by libraries in C and by worker processes."""
+    """Redirect to stderr what Python, C libraries and worker processes print."""
     sys.stdout.flush()
     with redirect_stdout(sys.stderr):
         try:
@@ -161,10 +167,10 @@ def _stdout_to_stderr() -> Iterator[None]:
 
 
 def _flush_c() -> None:
-    """Have C print what it has kept: at the program's end it would come to stand in the answer."""
+    """Flush the output buffers of C; at exit they would be written into the JSON output."""
     import ctypes
 
     try:
         ctypes.CDLL(None).fflush(None)
-    except (AttributeError, OSError, TypeError):  # where C's library is not in the program
+    except (AttributeError, OSError, TypeError):  # C's library is not accessible in the program.
         return

@@ -9,7 +9,7 @@ from bench.commands.options import place
 
 
 def add_bundle(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap bundle`."""
+    """Add the options of `simgap bundle`."""
     parser.add_argument(
         "run",
         metavar="RUN",

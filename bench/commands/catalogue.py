@@ -1,4 +1,4 @@
-"""What `simgap list` prints: the documents of `bench.commands.index` in words."""
+"""Format the documents of `bench.commands.index` as text for `simgap list`."""
 
 from __future__ import annotations
 
@@ -9,14 +9,21 @@ from bench.commands.index import PARTS
 
 
 def lines(what: str) -> list[str]:
-    """The lines for tuners, simulators, systems, effects, diagnosers, experiments, references or
-    schemas.
+    """Return the lines of one section of the catalogue.
+
+    Args:
+        what: One of `bench.commands.index.PARTS`, e.g. tuners, simulators or schemas.
     """
     return told(what, PARTS[what]())
 
 
 def told(what: str, documents: list[Document]) -> list[str]:
-    """The same of documents that are at hand."""
+    """Format given documents of a section of the catalogue.
+
+    Args:
+        what: Name of the section.
+        documents: Documents of its entries.
+    """
     lay = _LAID_OUT.get(what, _plain)
     return [line for document in documents for line in lay(document)]
 
@@ -26,13 +33,13 @@ def _plain(each: Document) -> list[str]:
 
 
 def _says(each: Document) -> str:
-    """Its sentence, or why it cannot be used here."""
+    """Return the description of an entry, or why it cannot be used here."""
     skipped = each.get("skipped")
     return f"skipped: {skipped}" if skipped else each["says"]
 
 
 def _experiment(each: Document) -> list[str]:
-    """A line for an experiment: what it lacks on this machine, its sentence, its tags."""
+    """Format an experiment: what is missing on this machine, its description, its tags."""
     lacks = []
     if each["skipped"]:
         lacks.append(f"skipped: {each['skipped']}")
@@ -71,7 +78,8 @@ def _channels(what: str, channels: list[Document]) -> list[str]:
 
 
 def _effect(each: Document) -> list[str]:
-    """Its sentence, then each coefficient with unit and plausible range on each kind of system."""
+    """Format an effect, with unit and plausible range of each coefficient on each kind of system.
+    """
     if each["skipped"]:
         return [f"{each['name']}: {_says(each)}"]
     result = [f"{each['name']} ({each['hook']}): {each['says']}"]

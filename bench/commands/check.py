@@ -9,7 +9,7 @@ from bench.commands.options import file
 
 
 def add_check(check: argparse.ArgumentParser) -> None:
-    """The options of `simgap check`."""
+    """Add the options of `simgap check`."""
     check.add_argument(
         "name", metavar="NAME", help="registered name, e.g. cma_es, pendulum or drag.linear"
     )

@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from bench.study import Study
 
 _CHANGES = ("targets", "budget", "training_budget", "timeout", "memory")
-"""Options that change an experiment's key of the same name."""
+"""Options that change the key of the same name in an experiment."""
 
 
 def add_compare(compare: argparse.ArgumentParser) -> None:
-    """The options of `simgap compare`."""
+    """Add the options of `simgap compare`."""
     compare.add_argument(
         "experiment",
         metavar="EXPERIMENT",
@@ -129,7 +129,7 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
 
 
 def _chosen(options: argparse.Namespace) -> Experiment:
-    """The experiment that the options of `compare` describe."""
+    """Build the experiment that the options of `compare` describe."""
     from bench.api.compare import choose, given, wanted
 
     trust = options.trust or not options.jobs
@@ -141,10 +141,10 @@ def _chosen(options: argparse.Namespace) -> Experiment:
 
 
 def _refuse_beside_resume(options: argparse.Namespace) -> None:
-    """Refuse options that would change what is resumed.
+    """Reject options that would change the study to be resumed.
 
     Raises:
-        InputError: there are some.
+        InputError: There are such options.
     """
     from sims.base import InputError
 
@@ -159,7 +159,7 @@ def _refuse_beside_resume(options: argparse.Namespace) -> None:
 
 
 def _begun(options: argparse.Namespace) -> list[Study]:
-    """The study that is begun or resumed; several of a sweep."""
+    """Begin or resume the study, or the studies of a sweep."""
     from bench.runs.size import check_comparison
     from bench.study import begin_all, parts_of, resume
 
@@ -175,7 +175,7 @@ def _begun(options: argparse.Namespace) -> list[Study]:
 def _compare(options: argparse.Namespace, say: Say) -> Answer:
     from bench.study import conclude
 
-    # First of all: a scheduler that does not answer leaves no folder behind.
+    # Connect to the cluster first, so that an unreachable scheduler leaves no folder.
     pool = cluster_pool(options.cluster)
     studies = _begun(options)
     answers = []
@@ -194,7 +194,7 @@ def _compare(options: argparse.Namespace, say: Say) -> Answer:
 
 
 def _made(study: Study, pool: Pool | None, options: argparse.Namespace, say: Say) -> Answer:
-    """Make and report one study."""
+    """Run and report one study."""
     from bench.commands.outcome import outcome
     from bench.commands.progress import Bars
 
@@ -213,9 +213,9 @@ def _made(study: Study, pool: Pool | None, options: argparse.Namespace, say: Say
 
 
 def _left(study: Study, made: Made, resume: str) -> int:
-    """Say what is missing and how to go on; returns the exit code."""
+    """Print what is missing and how to continue; return the exit code."""
     why = "interrupted" if made.interrupted else made.stopped or "stopped"
-    things, ended = study.status().what.rsplit(" ", 1)  # e.g. runs finished
+    things, ended = study.status().what.rsplit(" ", 1)  # For example: runs finished.
     for line in (
         f"{why}; {made.finished} of {made.planned} {things} are {ended} and kept",
         f"to finish: {resume}",

@@ -1,5 +1,6 @@
-"""The command `simgap completion`: a script for a shell, which completes commands, options, files
-and names without starting Python.
+"""The command `simgap completion`: a completion script for a shell.
+
+The script completes commands, options, files and names without starting Python.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ _simgap_experiments() {{ compgen -W "{experiments}" -- "$1"; compgen -f -- "$1";
 _simgap_parts() {{ compgen -W "{parts}" -- "$1"; }}
 _simgap_schemas() {{ compgen -W "{schemas}" -- "$1"; }}
 """
-"""By which bash knows names; the other shells complete files there."""
+"""Functions of bash that complete names; the other shells complete files instead."""
 
 
 def add_completion(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap completion`."""
+    """Add the options of `simgap completion`."""
     parser.add_argument("shell", choices=SHELLS, help="which shell the script is for")
     parser.set_defaults(command=_completion)
 
@@ -32,7 +33,12 @@ def _completion(options: argparse.Namespace, say: Say) -> Answer:
 
 
 def completion(parser: argparse.ArgumentParser, shell: str) -> str:
-    """The script for a shell; `parser` is that of the command line."""
+    """Build the completion script for a shell.
+
+    Args:
+        parser: Parser of the command line.
+        shell: One of `SHELLS`.
+    """
     import shtab
 
     from bench.problem import experiment
@@ -60,11 +66,11 @@ _WORDS = {
     ("check", "name"): "_simgap_parts",
     ("schema", "name"): "_simgap_schemas",
 }
-"""By command and argument the function that knows its words."""
+"""Functions of bash that complete an argument, by command and argument."""
 
 
 def _complete(command: str, action: argparse.Action, shtab: Any) -> None:
-    """Say what completes an argument: words that are known, or a file."""
+    """Set the completion of an argument: known names, or a file."""
     known = _WORDS.get((command, action.dest))
     if known:
         complete = {**shtab.FILE, "bash": known}
@@ -72,5 +78,5 @@ def _complete(command: str, action: argparse.Action, shtab: Any) -> None:
         complete = shtab.FILE
     else:
         return
-    # The library looks for an attribute of this name.
+    # The library shtab reads an attribute of this name.
     action.complete = complete  # type: ignore[attr-defined]

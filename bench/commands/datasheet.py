@@ -19,7 +19,7 @@ from bench.commands.options import (
 
 
 def add_datasheet(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap datasheet`."""
+    """Add the options of `simgap datasheet`."""
     parser.add_argument(
         "recordings",
         metavar="RECORDING.csv",
@@ -60,7 +60,7 @@ def add_datasheet(parser: argparse.ArgumentParser) -> None:
 
 
 def _datasheet(options: argparse.Namespace, say: Say) -> Answer:
-    """Make a sheet, and the explanation that it is from where there is none."""
+    """Make a data sheet; explain the logs first unless an explanation is given."""
     from bench.api.datasheet import datasheet, refuse_joint
     from bench.api.explain import explain
     from bench.commands.search_progress import ProgressDisplay
@@ -68,7 +68,7 @@ def _datasheet(options: argparse.Namespace, say: Say) -> Answer:
     from sims.files import refuse_full
 
     load_plugins(options.plugin)
-    # Before the work, which may take minutes.
+    # Check this before the work, which may take minutes.
     refuse_full(options.out)
     logs, free, source = options.recordings, names(options.free), options.explained
     display = ProgressDisplay(options.budget, silent=options.json)
@@ -87,7 +87,7 @@ def _datasheet(options: argparse.Namespace, say: Say) -> Answer:
                 stop=interrupts.asked,
                 listener=display,
             )
-            # What took minutes is kept, whatever comes of the sheet.
+            # The explanation took minutes, so it is written even if the data sheet fails.
             source.write(options.out / "explained", pdf=options.pdf)
         display.finish("computing what these data would have shown")
         made = datasheet(

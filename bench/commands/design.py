@@ -9,7 +9,7 @@ from bench.commands.options import add_model, add_plugin, names, place, positive
 
 
 def add_design(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap design`."""
+    """Add the options of `simgap design`."""
     parser.add_argument(
         "recordings",
         metavar="RECORDING.csv",

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_diff(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap diff`."""
+    """Add the options of `simgap diff`."""
     for name in ("a", "b"):
         parser.add_argument(
             name,
@@ -52,10 +52,10 @@ def _diff(options: argparse.Namespace, say: Say) -> Answer:
 
 
 def _found(a: Path, b: Path) -> Compared | Explained:
-    """What differs, of two folders of one kind.
+    """Compare two folders of one kind.
 
     Raises:
-        InputError: they are of two kinds, or one is neither.
+        InputError: They are of two kinds, or one is neither.
     """
     from bench.differ import comparisons, explanations
     from sims.base import InputError

@@ -71,7 +71,7 @@ def _download(options: argparse.Namespace, say: Say) -> Answer:
 
 
 def _fetch(data_set: DataSet, source: str, out: Path | None) -> Path:
-    """Download one data set, with a progress bar; returns its folder."""
+    """Download one data set with a progress bar; return its folder."""
     import sys
 
     from tqdm import tqdm
@@ -96,7 +96,7 @@ def _fetch(data_set: DataSet, source: str, out: Path | None) -> Path:
 
 
 def _present(data_set: DataSet, out: Path | None) -> Path | None:
-    """The folder of a data set that need not be downloaded."""
+    """Return the folder of a data set that is already present; None if it must be downloaded."""
     if out is None:
         return data_set.folder()
     folder = out / data_set.name
@@ -104,7 +104,7 @@ def _present(data_set: DataSet, out: Path | None) -> Path | None:
 
 
 def _how_found(data_set: DataSet, out: Path) -> str:
-    """How experiments find a data set that was written into another folder than the usual one."""
+    """Explain how experiments find a data set in a folder other than the default one."""
     from bench.datasets.catalogue import FOLDER_VARIABLES, search_folders
 
     if out.resolve() in [folder.resolve() for folder in search_folders(data_set.kind)]:
@@ -126,7 +126,7 @@ def _lines(data_set: DataSet) -> list[str]:
 
 
 def _experiments(data_set: DataSet) -> list[str]:
-    """Names of the project's experiments that need a data set."""
+    """Return the names of the project's experiments that need a data set."""
     from bench.datasets.catalogue import providing
     from bench.problem.experiment import load, names
 

@@ -21,17 +21,17 @@ from bench.commands.options import (
 )
 
 _PICTURED = (".html", ".png", ".pdf")
-"""Endings of what is for the eye: the report names the pictures."""
+"""File extensions of figures and reports, which are not listed one by one."""
 
 _SETTINGS = (
     "system", "model", "engine", "free", "tuner", "seed", "budget", "whole", "pieces", "thorough",
     "force", "plugin",
 )  # fmt: skip
-"""Options on which an answer depends."""
+"""Options that affect the result."""
 
 
 def add_explain(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap explain`."""
+    """Add the options of `simgap explain`."""
     parser.add_argument(
         "recordings",
         metavar="RECORDING.csv",
@@ -128,7 +128,7 @@ def add_explain(parser: argparse.ArgumentParser) -> None:
 
 
 def add_score(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap score`."""
+    """Add the options of `simgap score`."""
     parser.add_argument(
         "model",
         metavar="MODEL",
@@ -150,7 +150,7 @@ def add_score(parser: argparse.ArgumentParser) -> None:
 
 
 def _explain(options: argparse.Namespace, say: Say) -> Answer:
-    """Explain a recording, write what was found, print the account."""
+    """Explain a recording, write the results, print the text summary."""
     from bench.api.explain import explain
     from bench.commands.search_progress import ProgressDisplay
     from bench.gap.report.account import account
@@ -169,7 +169,7 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
     load_plugins(options.plugin)
     if options.each:
         return _explain_each(options, say)
-    # Before the work, which may take minutes.
+    # Check this before the work, which may take minutes.
     if options.out is not None:
         refuse_full(options.out)
     started = now()
@@ -223,7 +223,7 @@ def _explain(options: argparse.Namespace, say: Say) -> Answer:
 
 
 def _explain_each(options: argparse.Namespace, say: Say) -> Answer:
-    """Explain every recording by itself, as the rows come in, and print what they say together."""
+    """Explain every recording separately, print each result, then print the overall summary."""
     from bench.commands.search_progress import ProgressDisplay
     from bench.gap.each.page import Asked, write_page
     from bench.gap.each.rows import TABLE, Row, named, told

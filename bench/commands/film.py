@@ -10,7 +10,7 @@ from bench.commands.options import add_force, add_pdf, place
 
 
 def add_film(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap film`."""
+    """Add the options of `simgap film`."""
     parser.add_argument(
         "recording",
         metavar="RECORDING.csv",
@@ -36,7 +36,7 @@ def add_film(parser: argparse.ArgumentParser) -> None:
 
 
 def add_track(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap track`."""
+    """Add the options of `simgap track`."""
     parser.add_argument(
         "video",
         metavar="VIDEO",
@@ -63,7 +63,12 @@ def add_track(parser: argparse.ArgumentParser) -> None:
 
 
 def film(options: argparse.Namespace, say: Say) -> Answer:
-    """Film a recorded ball."""
+    """Film a recorded ball.
+
+    Args:
+        options: Options of `simgap film`.
+        say: Prints a line of text.
+    """
     from bench.recordings.film import write
 
     frames, seconds = write(
@@ -89,7 +94,12 @@ def film(options: argparse.Namespace, say: Say) -> Answer:
 
 
 def track(options: argparse.Namespace, say: Say) -> Answer:
-    """Track a ball, write the recording and its picture."""
+    """Track a ball; write the recording and its figure.
+
+    Args:
+        options: Options of `simgap track`.
+        say: Prints a line of text.
+    """
     from bench.figures.track import drawn
     from bench.recordings.tracking import write
 

@@ -9,7 +9,7 @@ from bench.commands.options import names, place
 
 
 def add_import(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap import`."""
+    """Add the options of `simgap import`."""
     parser.add_argument(
         "logs",
         metavar="LOG",

@@ -1,5 +1,7 @@
-"""What there is, as documents: commands with their options, tuners, simulators, systems, effects,
-diagnosers, experiments and schemas. `simgap list` prints them, in words or as they are.
+"""Catalogue of the program as documents, which `simgap list` prints as text or JSON.
+
+It lists commands with their options, tuners, simulators, systems, effects, diagnosers, experiments,
+references and schemas.
 """
 
 from __future__ import annotations
@@ -21,17 +23,17 @@ _TYPES = {
     "place": "path",
     "file": "path",
 }
-"""What an option takes, by the function that reads it, or by what argparse makes of it."""
+"""Type of an option's value, by the function that parses it or the class of argparse's action."""
 
 
 def everything(parser: argparse.ArgumentParser) -> Document:
-    """The whole index; `parser` is that of the command line."""
+    """Build the whole catalogue from the parser of the command line."""
     return {"commands": commands(parser), **{name: make() for name, make in PARTS.items()}}
 
 
 def commands(parser: argparse.ArgumentParser) -> list[Document]:
-    """Every command with its options, as `simgap --help` has them."""
-    # argparse has no public way to ask a parser for what was added to it.
+    """List every command with its options, as `simgap --help` does."""
+    # argparse has no public way to list the arguments of a parser.
     (choices,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
     says = {action.dest: action.help for action in choices._choices_actions}
     return [
@@ -51,7 +53,7 @@ def commands(parser: argparse.ArgumentParser) -> list[Document]:
 
 
 def _option(action: argparse.Action) -> Document:
-    """An argument or option."""
+    """Describe an argument or option."""
     default = None if action.default in ([], "") else action.default
     read = getattr(action.type, "__name__", "")
     flag = _TYPES.get(type(action).__name__)
@@ -70,12 +72,12 @@ def _option(action: argparse.Action) -> Document:
 
 
 def is_path(action: argparse.Action) -> bool:
-    """Whether an argument is the path of a file or folder."""
+    """Return whether an argument is the path of a file or folder."""
     return _TYPES.get(getattr(action.type, "__name__", "")) == "path"
 
 
 def tuners() -> list[Document]:
-    """Every tuner: whether it learns, uses chance, and what it needs."""
+    """List every tuner: whether it learns, whether it is stochastic, and what it requires."""
     from bench.registry import tuners as registry
 
     def told(kind: Any) -> Document:
@@ -89,14 +91,14 @@ def tuners() -> list[Document]:
 
 
 def simulators() -> list[Document]:
-    """Every simulator, in a line."""
+    """List every simulator with its description."""
     from bench.registry import simulators as registry
 
     return [_part(registry, name, lambda _: {}) for name in registry.names()]
 
 
 def systems() -> list[Document]:
-    """Every simulator's declaration: numbers, states and signals with units and ranges."""
+    """List every simulator's declared numbers, states and signals, with units and ranges."""
     from bench.registry import simulators as registry
 
     return [_part(registry, name, _declared) for name in registry.names()]
@@ -132,9 +134,7 @@ def _channels(channels: Iterable[Any]) -> list[Document]:
 
 
 def effects() -> list[Document]:
-    """Every effect: where it acts, and each coefficient with its unit and plausible range on each
-    kind of system.
-    """
+    """List every effect, with unit and plausible range of each coefficient on each system kind."""
     from sims.effects import registry
 
     return [_part(registry, name, _acting) for name in registry.names()]
@@ -166,7 +166,7 @@ def _acting(effect: Any) -> Document:
 
 
 def diagnosers() -> list[Document]:
-    """Every diagnoser: whether it learns, and what it needs."""
+    """List every diagnoser: whether it learns, and what it requires."""
     from bench.registry import diagnosers as registry
 
     def told(kind: Any) -> Document:
@@ -176,7 +176,7 @@ def diagnosers() -> list[Document]:
 
 
 def experiments() -> list[Document]:
-    """Every experiment that comes with the project, and what it lacks on this machine."""
+    """List every experiment of the project, and what is missing for it on this machine."""
     from bench.problem import experiment
     from bench.problem.availability import availability
 
@@ -205,7 +205,7 @@ def experiments() -> list[Document]:
 
 
 def references() -> list[Document]:
-    """Every reference result that `simgap plot --behind NAME` draws."""
+    """List every reference result that `simgap plot --behind NAME` draws."""
     from bench.store.reference import find, names
 
     return [
@@ -224,14 +224,14 @@ def references() -> list[Document]:
 
 
 def schemas() -> list[Document]:
-    """Every schema that `simgap schema NAME` prints."""
+    """List every schema that `simgap schema NAME` prints."""
     from bench.schemas import names, schema
 
     return [{"name": name, "says": schema(name)["title"]} for name in names()]
 
 
 def _part(registry: Any, name: str, told: Callable[[Any], Document]) -> Document:
-    """A registered part, or why it cannot be used here."""
+    """Describe a registered part, or why it cannot be used here."""
     from bench.registry import SkippedError
 
     try:
@@ -251,4 +251,4 @@ PARTS: dict[str, Callable[[], list[Document]]] = {
     "references": references,
     "schemas": schemas,
 }
-"""What `simgap list` has lists of, beside commands and the places of a robot."""
+"""Sections of the catalogue in addition to commands and places of a robot, by name."""

@@ -1,4 +1,4 @@
-"""The command `simgap info`: what a report of a fault has to say of the machine."""
+"""The command `simgap info`: information about the machine for bug reports."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bench.commands.answer import Answer, Document, Say
 
 
 def add_info(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap info`."""
+    """Add the options of `simgap info`."""
     parser.set_defaults(command=_info)
 
 
@@ -23,7 +23,7 @@ def _info(options: argparse.Namespace, say: Say) -> Answer:  # noqa: ARG001
 
 
 def info() -> Document:
-    """Versions, engines, platform and paths."""
+    """Collect versions, engines, platform and paths."""
     import os
     import platform
 
@@ -51,7 +51,7 @@ def info() -> Document:
 
 
 _HOME = Path(__file__).resolve().parents[2]
-"""Where simgap's packages lie."""
+"""Folder that contains simgap's packages."""
 
 
 def _cache() -> Path:
@@ -67,7 +67,8 @@ def _data_sets() -> Path:
 
 
 def _revision() -> str | None:
-    """The commit of a checkout, with a + where its files differ; None of an installed wheel."""
+    """Return the commit of a checkout, with + if files were changed; None for an installed wheel.
+    """
     import subprocess
 
     if not (_HOME / ".git").exists():
@@ -89,7 +90,7 @@ def _processors() -> int | None:
 
 
 def _memory() -> int | None:
-    """Bytes of the machine; None where it does not say."""
+    """Return the memory of the machine in bytes; None if unknown."""
     import os
 
     try:
@@ -99,7 +100,7 @@ def _memory() -> int | None:
 
 
 def _engines() -> Iterator[Document]:
-    """Every engine: its package is loaded, since one that is there may not work."""
+    """List every engine; each package is imported, since an installed one may not work."""
     from bench import __version__
     from sims import bullet
     from sims.engines import mujoco_bodies
@@ -111,21 +112,21 @@ def _engines() -> Iterator[Document]:
 
 
 def _packages() -> Iterator[Document]:
-    """What simgap needs, and what its extras do, as the installed metadata has it."""
+    """List the packages that simgap and its extras require, by the installed metadata."""
     from importlib.metadata import PackageNotFoundError, requires
 
     from packaging.requirements import Requirement
 
     try:
         wanted = [Requirement(text) for text in requires("simgap") or ()]
-    except PackageNotFoundError:  # run from its source, without an install
+    except PackageNotFoundError:  # Run from the source, without an installation.
         wanted = []
     for each in wanted:
         extra = _extra(str(each.marker or ""))
         if extra == "dev" or not (each.marker is None or each.marker.evaluate({"extra": extra})):
             continue
         version = _version(each.name)
-        # simgap is on no index, so that its extras cannot be installed by name.
+        # simgap is in no package index, so its extras cannot be installed by name.
         remedy = f'pip install "{each.name}{each.specifier}"'
         missing = None if version else f"not installed ({remedy})"
         if version and not each.specifier.contains(version, prereleases=True):
@@ -134,7 +135,7 @@ def _packages() -> Iterator[Document]:
 
 
 def _extra(marker: str) -> str:
-    """The extra that a requirement is of; empty where it is of none."""
+    """Return the extra that a requirement belongs to; empty if it belongs to none."""
     _, _, behind = marker.partition("extra == ")
     return behind.split()[0].strip("\"')") if behind else ""
 
@@ -149,18 +150,18 @@ def _version(package: str) -> str | None:
 
 
 def _missing(package: str, load: Callable[[], Any]) -> str | None:
-    """Why a package cannot be used; None where it can."""
+    """Return why a package cannot be used; None if it can."""
     try:
         load()
     except ModuleNotFoundError:
         return f"not installed (pip install {package})"
-    except Exception as error:  # of another machine, half installed
+    except Exception as error:  # Built for another machine, or incompletely installed.
         return f"{type(error).__name__}: {error}"
     return None
 
 
 def _told(found: Document) -> Iterator[str]:
-    """The same in words."""
+    """Format the information as text."""
     revision = f" ({found['revision']})" if found["revision"] else ""
     yield f"simgap {found['simgap']}{revision}, {found['implementation']} {found['python']}"
     memory = f", {found['memory'] / 2**30:.3g} GiB" if found["memory"] else ""

@@ -1,4 +1,4 @@
-"""Ctrl-C as a wish to end with what there is; once more, and it ends at once."""
+"""Interrupt handler: the first Ctrl-C requests a clean stop, the second interrupts at once."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 
 class Interrupts:
-    """While it is entered the first Ctrl-C is noted, and the second one is an interrupt as ever.
+    """Context in which the first Ctrl-C requests a stop, and the second one interrupts as usual.
 
     Args:
-        say: prints what the first Ctrl-C does; a line on stderr if None.
+        say: Prints what the first Ctrl-C does; a line on stderr if None.
     """
 
     def __init__(self, say: Callable[[str], None] | None = None) -> None:
@@ -20,13 +20,13 @@ class Interrupts:
         self._say = say or _print_line
 
     def asked(self) -> bool:
-        """Whether somebody wants an end."""
+        """Return whether a stop has been requested."""
         return self._asked
 
     def __enter__(self) -> Interrupts:
-        # Python lets the main thread alone answer signals.
+        # Python handles signals in the main thread only.
         self._answers = threading.current_thread() is threading.main_thread()
-        # Who ignores them, as in the background of a shell, goes on doing so.
+        # Keep ignoring SIGINT if it is ignored, as for background jobs of a shell.
         if self._answers and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, self._first)
         return self

@@ -14,7 +14,7 @@ _LISTS = (
 
 
 def add_list(listing: argparse.ArgumentParser) -> None:
-    """The options of `simgap list`."""
+    """Add the options of `simgap list`."""
     listing.add_argument(
         "what",
         choices=_LISTS,
@@ -27,7 +27,7 @@ def add_list(listing: argparse.ArgumentParser) -> None:
 
 
 def add_schema(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap schema`."""
+    """Add the options of `simgap schema`."""
     parser.add_argument("name", metavar="NAME", help="a command, or see `simgap list schemas`")
     parser.set_defaults(command=_schema)
 

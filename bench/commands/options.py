@@ -1,4 +1,4 @@
-"""Options that several commands have, and the types of their values."""
+"""Options that several commands share, and parsers of their values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ if TYPE_CHECKING:
 
 
 def add_plugin(parser: argparse.ArgumentParser, more: str) -> None:
-    """The option ``--plugin FILE``; `more` says what such a file adds."""
+    """Add the option ``--plugin FILE``; `more` says what such a file adds.
+
+    Args:
+        parser: Parser of the command.
+        more: Parts that the file adds, e.g. "systems".
+    """
     parser.add_argument(
         "--plugin",
         type=file,
@@ -28,7 +33,12 @@ def add_model(
     parser: argparse.ArgumentParser,
     text: str = "take it for this robot, whatever the .toml says: an MJCF or URDF",
 ) -> None:
-    """The option ``--model FILE``; `text` says what it is for."""
+    """Add the option ``--model FILE``; `text` is its help.
+
+    Args:
+        parser: Parser of the command.
+        text: Help of the option.
+    """
     parser.add_argument(
         "--model",
         type=place,
@@ -38,7 +48,7 @@ def add_model(
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:
-    """The option ``--force``."""
+    """Add the option ``--force``."""
     parser.add_argument(
         "--force",
         action="store_true",
@@ -47,7 +57,7 @@ def add_force(parser: argparse.ArgumentParser) -> None:
 
 
 def add_pdf(parser: argparse.ArgumentParser) -> None:
-    """The option ``--pdf``, which `bench.cli` obeys for every command that has it."""
+    """Add the option ``--pdf``, which `bench.cli` handles for every command that has it."""
     parser.add_argument(
         "--pdf",
         action="store_true",
@@ -56,7 +66,7 @@ def add_pdf(parser: argparse.ArgumentParser) -> None:
 
 
 def add_trust(parser: argparse.ArgumentParser) -> None:
-    """The option ``--trust``."""
+    """Add the option ``--trust``."""
     parser.add_argument(
         "--trust",
         action="store_true",
@@ -66,12 +76,12 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
 
 
 def positive(text: str) -> int:
-    """A whole number of at least 1."""
+    """Parse a whole number of at least 1."""
     return _whole(text, 1)
 
 
 def natural(text: str) -> int:
-    """A whole number of at least 0."""
+    """Parse a whole number of at least 0."""
     return _whole(text, 0)
 
 
@@ -91,7 +101,7 @@ def _whole(text: str, least: int) -> int:
 
 
 def seconds(text: str) -> float:
-    """A number of seconds above 0."""
+    """Parse a number of seconds above 0."""
     try:
         value = float(text)
     except ValueError:
@@ -102,14 +112,14 @@ def seconds(text: str) -> float:
 
 
 def place(text: str) -> Path:
-    """The path of what is there, or could be."""
+    """Parse the path of a file or folder, which need not exist."""
     from sims.limits import cut
 
     try:
         Path(text).lstat()
     except (FileNotFoundError, NotADirectoryError):
         pass
-    # Too long, of links that lead in a circle, or not ours to look at.
+    # The path is too long, contains circular links, or is not accessible.
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise argparse.ArgumentTypeError(f"expected a path, found '{cut(text)}' ({why})") from None
@@ -117,21 +127,28 @@ def place(text: str) -> Path:
 
 
 def file(text: str) -> str:
-    """The same of a file that is named in words."""
+    """Check the path of a file, and return it as text."""
     place(text)
     return text
 
 
 def names(text: str) -> list[str]:
-    """Names with commas between."""
+    """Parse a list of names separated by commas."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
 @contextmanager
 def said_as(option: str, value: object) -> Iterator[None]:
-    """A fault that begins with the value is said with the option that gave it.
+    """Prefix error messages that begin with an option's value with the option's name.
 
-    What has no command line around it knows values, and says nothing of options.
+    Code below the command line knows values but not options.
+
+    Args:
+        option: Name of the option, e.g. ``--out``.
+        value: Its value.
+
+    Raises:
+        InputError: The error of the context, with the prefix.
     """
     from sims.base import InputError
 
@@ -144,10 +161,10 @@ def said_as(option: str, value: object) -> Iterator[None]:
 
 
 def cluster_pool(address: str | None) -> Pool | None:
-    """The Dask cluster with this scheduler; None without one.
+    """Return the Dask cluster with this scheduler address; None without an address.
 
     Raises:
-        InputError: nobody answers there, or its workers have other code.
+        InputError: The scheduler does not respond, or its workers have other code.
     """
     if not address:
         return None

@@ -1,4 +1,4 @@
-"""What a study's folder holds once it has been reported, as a document."""
+"""Summary document of the folder of a reported study."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     from bench.study import Study
 
 _DRAWN = "figures"
-"""The folder of figures."""
+"""Name of the folder of figures."""
 
 
 def outcome(study: Study) -> Document:
-    """Name, folder, files, how its targets and tuners were kept apart, and what came out."""
+    """Summarise a study: name, folder, files, isolation, kind of salt, and results."""
     experiment = study.configuration.experiment
     return {
         "name": experiment.name,
@@ -28,16 +28,16 @@ def outcome(study: Study) -> Document:
 
 
 def files(folder: Path) -> list[Path]:
-    """The files of a folder of results, and its figures; not what is kept of single runs or
-    shots.
+    """List the files of a result folder and its figures, without journals of single runs or shots.
     """
     inside = [*folder.glob("*"), *(folder / _DRAWN).glob("*")]
     return sorted(path for path in inside if path.is_file() and not path.name.startswith("."))
 
 
 def results(table: Path) -> list[Document]:
-    """The last line of each tuner, range and metric in a table, with its columns; all of a bounce
-    shot's and of diagnosers'; none where there is no table.
+    """Read the last row of each tuner, range and metric from a table.
+
+    All rows are read for bounce shots and diagnosers, and none if there is no table.
     """
     if not table.is_file():
         return []

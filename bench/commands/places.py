@@ -1,4 +1,4 @@
-"""What `simgap list places` prints: the places of a robot, and what can act at them."""
+"""Text and JSON of `simgap list places`: places of a robot, and effects that can act there."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from sims.robot.system import RobotSystem
 
 
 def lines(model: Path) -> Iterator[str]:
-    """The places of a model file, its signals, and the effects of each kind of place."""
+    """Yield lines about the places and signals of a model file, and the effects by kind of place.
+    """
     kind = cast(type[RobotSimulator], robot(model))
     yield from about(kind)
     yield from _joints(kind.robot)
@@ -33,7 +34,7 @@ def lines(model: Path) -> Iterator[str]:
 
 
 def document(model: Path) -> Document:
-    """The same for programs."""
+    """Build the JSON document of the places of a model file."""
     kind = cast(type[RobotSimulator], robot(model))
     acting = there(kind.system)
     return {
@@ -84,14 +85,14 @@ def _range(ends: tuple[float, float], unit: str) -> str:
 
 
 def _effects(system: type[RobotSystem]) -> Iterator[str]:
-    """A line for each kind of place with the effects that can act there."""
+    """Yield a line for each kind of place with the effects that can act there."""
     for kind, named in there(system).items():
         at = "of the world" if kind == "world" else f"at a {kind}, as {named[0]}@NAME or @*"
         yield f"  effects {at.replace('a actuator', 'an actuator')}: {', '.join(named)}"
 
 
 def there(system: type[RobotSystem]) -> dict[str, list[str]]:
-    """Effects that can act on a robot, by the kind of their places."""
+    """Return the names of effects that can act on a robot, by the kind of their places."""
     found: dict[str, list[str]] = {}
     for name in effects.names():
         effect = effects.get(name)

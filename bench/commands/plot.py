@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_plot(plot: argparse.ArgumentParser) -> None:
-    """The options of `simgap plot`."""
+    """Add the options of `simgap plot`."""
     plot.add_argument(
         "runs",
         metavar="RUN",
@@ -51,7 +51,7 @@ def _plot(options: argparse.Namespace, say: Say) -> Answer:
             admit(files, opened(part).configuration.experiment)
     references = [find(name) for name in options.behind]
     if len(options.runs) == 1 and not options.out:
-        # Before anything is drawn.
+        # Check the references before anything is drawn.
         for part in parts_of(options.runs[0]):
             for reference in references:
                 reference.mismatches(opened(part).configuration.experiment)
@@ -72,7 +72,7 @@ def _plot(options: argparse.Namespace, say: Say) -> Answer:
 
 
 def _again(folder: Path, references: Sequence[Reference], say: Say) -> Answer:
-    """Report a study, or those of a sweep or of a file that names several, again."""
+    """Report again a study, or the studies of a sweep or of a file with several studies."""
     from bench.commands.outcome import outcome
     from bench.study import conclude, opened, parts_of
 
@@ -89,7 +89,7 @@ def _again(folder: Path, references: Sequence[Reference], say: Say) -> Answer:
 def _each_before(
     folders: Sequence[Path], references: Sequence[Reference], out: Path, say: Say
 ) -> list[Document]:
-    """Draw several comparisons, each before the references that are of its problem."""
+    """Draw each of several comparisons over the references that belong to its problem."""
     from sims.base import InputError
 
     drawn = []
@@ -106,7 +106,7 @@ def _each_before(
 def _before(
     folder: Path, references: Sequence[Reference], out: Path, say: Say, name: str = ""
 ) -> list[Document]:
-    """Draw a comparison before references; nothing without one."""
+    """Draw a comparison over references in grey; draw nothing without references."""
     if not references:
         return []
     from bench.behind import draw

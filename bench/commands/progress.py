@@ -6,16 +6,16 @@ import sys
 from collections.abc import Callable
 
 _TERMINAL_PAUSE = 0.2
-"""Shortest time between two updates of a bar on a terminal, in seconds."""
+"""Minimum time between two updates of a bar on a terminal, in seconds."""
 _LOG_PAUSE = 30.0
-"""Shortest time between two lines in a log, in seconds."""
+"""Minimum time between two lines in a log, in seconds."""
 
 
 class Bars:
-    """Progress bars, one after another; tqdm estimates the time left.
+    """Progress bars, one after another; tqdm estimates the remaining time.
 
     Args:
-        unit: what is counted.
+        unit: What is counted.
     """
 
     def __init__(self, unit: str = "run") -> None:
@@ -29,7 +29,15 @@ class Bars:
         self._close()
 
     def start(self, title: str, total: int) -> Callable[[], None]:
-        """Begin a bar of `total` steps in place of the last one; returns what advances it."""
+        """Begin a bar that replaces the previous one.
+
+        Args:
+            title: Text in front of the bar.
+            total: Number of steps.
+
+        Returns:
+            Function that advances the bar by one step.
+        """
         from tqdm import tqdm
 
         self._close()

@@ -1,5 +1,7 @@
-"""Whether a recording says where bodies that float begin: nothing of that is estimated, and from
-elsewhere the same commands make another motion.
+"""Check that a recording states the initial poses of floating bodies.
+
+Initial poses are not estimated, and the same commands produce a different motion from a different
+initial pose.
 """
 
 from __future__ import annotations
@@ -13,7 +15,17 @@ from sims.recording.recording import Recording
 
 
 def unplaced(recording: Recording, kind: type[Simulator]) -> Iterator[Oddity]:
-    """Joints of what floats of which a run states nothing; its first such run stands for all."""
+    """Find floating joints whose initial state is missing in some run.
+
+    Only the first run without the state is reported for each joint.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        One certain anomaly for each such joint.
+    """
     own: dict[str, list[str]] = {}
     for name in afloat(kind):
         joint = name.split(".", 1)[1].rpartition(".")[0]

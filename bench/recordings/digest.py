@@ -1,4 +1,4 @@
-"""What a recording stands in, in one number: any of its files changed, another number."""
+"""Hash of a recording and of all files that it uses."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from sims.recording.lerobot import episode_of, files_of
 from sims.recording.mapping import mapped
 
 PIECE = 1 << 20
-"""Bytes read at once: a bag may be larger than the memory."""
+"""Number of bytes read at once; a bag file may be larger than the memory."""
 _INCLUDE = re.compile(rb"<include\s+file\s*=\s*[\"']([^\"']+)[\"']")
 
 
 def digest_of(path: Path, told: str = "") -> str:
-    """Of a recording: its table, its description, the logs and bags that this maps, and its model.
+    """Hash a recording: its table, its description, the mapped logs and bags, and its model.
 
     Args:
-        path: of its table or description.
-        told: what else makes it another one.
+        path: Path of its table or description.
+        told: Further text that is part of the hash.
 
     Raises:
-        InputError: the table or the description cannot be read.
+        InputError: The table or the description cannot be read.
     """
     digest = hashlib.sha256(told.encode())
     description = description_of(path)
@@ -42,9 +42,9 @@ def digest_of(path: Path, told: str = "") -> str:
 
 
 def content_of(path: Path) -> bytes:
-    """What stands for a file and for what it includes, or for the bag that a path leads into.
+    """Return the hash of a file and of the files that it includes, or of the bag or episode.
 
-    Nothing where there is none: whoever reads it will say so.
+    Missing files contribute nothing; reading them later reports the error.
     """
     episode = episode_of(path)
     if episode is not None:
@@ -64,7 +64,7 @@ def content_of(path: Path) -> bytes:
 
 
 def _with_included(model: Path) -> list[Path]:
-    """A model file, and those that it includes, which MuJoCo looks for beside it."""
+    """Return a model file and the files that it includes, searched in the folder of the model."""
     files, found = [model], 0
     while found < len(files):
         inner = files[found]
@@ -77,7 +77,10 @@ def _with_included(model: Path) -> list[Path]:
 
 @lru_cache(maxsize=256)
 def _hashed(path: Path, _changed: int, _size: int) -> bytes:
-    """Of a file, which many logs may name; one changed since is another one."""
+    """Return the hash of a file; cached, as many logs may use the same file.
+
+    The unused arguments are part of the cache key, so a changed file is hashed again.
+    """
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while piece := file.read(PIECE):

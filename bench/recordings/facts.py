@@ -1,4 +1,4 @@
-"""What is in a recording, as numbers: of each run and of each signal."""
+"""Statistics of each run and each signal of a recording."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from sims.recording.recording import Recording, Run
 
 
 class RunFacts(NamedTuple):
-    """One run.
+    """Statistics of one run.
 
     Attributes:
-        name: of it.
-        held_out: whether no fit may see it.
-        samples: how many.
-        seconds: from the first to the last.
-        rate: Hz, by the median interval: the mean would be drawn away by a gap.
-        shortest: interval between two samples, s.
-        median: likewise.
-        longest: likewise.
-        gaps: intervals that are far longer than the others.
-        missing: empty cells of its channels.
+        name: Name of the run.
+        held_out: Whether the run is excluded from fits.
+        samples: Number of samples.
+        seconds: Time from the first sample to the last, s.
+        rate: Sampling rate in Hz from the median interval, which gaps do not change.
+        shortest: Shortest interval between two samples, s.
+        median: Median interval between two samples, s.
+        longest: Longest interval between two samples, s.
+        gaps: Number of intervals that are far longer than the others.
+        missing: Number of empty cells in its channels.
     """
 
     name: str
@@ -40,18 +40,18 @@ class RunFacts(NamedTuple):
 
 
 class SignalFacts(NamedTuple):
-    """One input or channel over all runs.
+    """Statistics of one input or channel over all runs.
 
     Attributes:
-        name: of it.
+        name: Name of the signal.
         kind: input or channel.
-        unit: of all that follows.
-        low: the least value.
-        high: the largest one.
-        missing: share of the samples.
-        stated: noise, 1 sigma, as the description has it; None where it has none.
-        estimated: noise, 1 sigma, judged from the signal; NaN where it cannot be told.
-        step: by which a quantised signal changes; 0 where it is not.
+        unit: Unit of all values below.
+        low: Smallest value.
+        high: Largest value.
+        missing: Share of missing samples.
+        stated: Noise in the description, 1 sigma; None if there is none.
+        estimated: Noise estimated from the signal, 1 sigma; NaN if it cannot be estimated.
+        step: Quantisation step; 0 if the signal is not quantised.
     """
 
     name: str
@@ -66,7 +66,7 @@ class SignalFacts(NamedTuple):
 
 
 def run_facts(run: Run) -> RunFacts:
-    """What a run is like."""
+    """Compute the statistics of a run."""
     intervals = np.diff(run.times)
     median = float(np.median(intervals))
     missing = sum(int(np.isnan(v).sum()) for v in run.channels.values())
@@ -85,10 +85,16 @@ def run_facts(run: Run) -> RunFacts:
 
 
 def signal_facts(recording: Recording, channel: Channel, kind: str) -> SignalFacts:
-    """What a signal is like."""
+    """Compute the statistics of a signal over all runs.
+
+    Args:
+        recording: Recording with the signal.
+        channel: Declaration of the signal.
+        kind: input or channel.
+    """
     signals = [(run.times, _of(run, channel.name)) for run in recording.runs]
     values = np.concatenate([v for _, v in signals])
-    # An input is what was commanded: it has no noise.
+    # An input is what was commanded, so it has no noise.
     noise = estimated(signals) if kind == "channel" else NoiseEstimate(np.nan, 0.0)
     return SignalFacts(
         channel.name,
@@ -104,14 +110,24 @@ def signal_facts(recording: Recording, channel: Channel, kind: str) -> SignalFac
 
 
 def declared(recording: Recording, kind: type[Simulator]) -> list[tuple[Channel, str]]:
-    """The recorded inputs and channels, each with the word for what it is."""
+    """Return the recorded inputs and channels, each with its kind: input or channel.
+
+    Args:
+        recording: Recording whose first run decides which signals are recorded.
+        kind: Simulator class of its system.
+    """
     first = recording.runs[0]
     inputs = [(c, "input") for c in kind.inputs if c.name in first.inputs]
     return inputs + [(c, "channel") for c in kind.channels if c.name in first.channels]
 
 
 def document(recording: Recording, kind: type[Simulator]) -> dict[str, Any]:
-    """All of it for programs."""
+    """Build the JSON document with the statistics of a recording.
+
+    Args:
+        recording: Recording to summarise.
+        kind: Simulator class of its system.
+    """
     return {
         "recording": recording.path,
         "system": recording.system,

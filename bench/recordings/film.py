@@ -1,4 +1,4 @@
-"""A recorded ball filmed: a video, and the camera that made it."""
+"""Render a recorded ball motion as a video, and write the camera that was used."""
 
 from __future__ import annotations
 
@@ -22,13 +22,24 @@ from sims.recording.write import refuse_existing
 def write(
     recording: Path, out: Path, run: str | None, pixels: int, seed: int, force: bool = False
 ) -> tuple[int, float]:
-    """Film one run with a published camera of this seed; returns the number of frames and the
-    seconds.
+    """Film one run with a camera drawn from a seed, whose parameters are published with the film.
+
+    Args:
+        recording: Path of a recording of system ball.
+        out: Path of the video.
+        run: Name of the run; None for the first one.
+        pixels: Size of the image in pixels, even, at least 16.
+        seed: Seed of the camera and of the look of the film.
+        force: Whether to render a film that exceeds the size limit.
+
+    Returns:
+        Number of frames, and duration in seconds.
 
     Raises:
-        InputError: the recording is of no ball or has no heights, or the video cannot be written.
+        InputError: The recording is not of a ball or has no heights, or the video cannot be
+            written.
     """
-    # Before the work: a film takes a while.
+    # Check this before the work, since rendering takes a while.
     refuse_existing([out, beside(out)])
     if pixels < 16 or pixels % 2:
         raise InputError(f"size {pixels}: expected an even number of at least 16 pixels")
@@ -41,7 +52,7 @@ def write(
     chosen = runs[run] if run is not None else data.runs[0]
     if "z" not in chosen.channels:
         raise InputError(f"{recording}: expected the channel z, found {', '.join(chosen.channels)}")
-    # A drop that was recorded by its height alone falls straight down at the origin.
+    # A drop recorded by its height alone falls straight down at the origin.
     zero = np.zeros(chosen.times.size)
     positions = np.stack([chosen.channels.get(name, zero) for name in ("x", "y", "z")], axis=1)
     if not np.isfinite(positions).all():
@@ -53,7 +64,7 @@ def write(
     camera, look = Camera.published(rng, pixels), Look.drawn(rng)
     stage = Stage(camera, look, radius, rng)
     filmed = Filmed(camera, radius, float(positions[0, 0]), float(positions[0, 1]))
-    # The camera is published with the film: with it, heights follow exactly.
+    # The camera is published with the film, so that exact heights follow from the images.
     description = {beside(out): described(filmed)}
     write_video(out, stage.film(positions), chosen.times, look.crf, description)
     return len(positions), float(chosen.times[-1] - chosen.times[0])

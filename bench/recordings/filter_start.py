@@ -1,8 +1,8 @@
 """Leave out the first samples of runs in which filters before a robot's actuators settle.
 
-The activation of a filter when a run begins is not recorded: a robot that has stood still has the
-first command there, MuJoCo begins at zero, and a log that was cut out of a motion has anything.
-After some time constants nothing depends on it, and what was commanded until then is known.
+The activation of a filter at the start of a run is not recorded. For a robot at rest it equals the
+first command, MuJoCo starts it at zero, and in a log that was cut out of a motion it can have any
+value. After a few time constants nothing depends on it, and the commands up to then are known.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ from sims.base import Simulator
 from sims.recording.recording import Recording, Run
 
 LARGEST_SHARE = 0.5
-"""Largest share of a run that may be left out."""
+"""Maximum share of a run that may be left out."""
 
 
 def leave_out_settling(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
     """Leave out the first samples of runs whose first activations are not known.
 
-    A run keeps all of its samples if its filters take more than half of it to settle, or if bodies
-    float, since nothing says where these are later; its filters then begin at the first commands.
+    A run keeps all of its samples if its filters take more than half of it to settle, or if the
+    robot has floating bodies, whose later poses are not recorded; its filters then begin at the
+    first commands.
 
     Args:
-        recording: as it was read.
-        kind: a simulator of its system.
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
 
     Returns:
-        The recording, and a message for the user, which is empty where nothing is left out.
+        The recording, and a message for the user, which is empty if nothing is left out.
     """
     if not kind.has_model:
         return recording, ""

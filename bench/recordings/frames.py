@@ -1,4 +1,4 @@
-"""Recordings in pandas data frames, of the systems and robots that are registered."""
+"""Recordings in pandas data frames, for registered systems and for robots."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from sims.user_toml import table
 
 @dataclass(frozen=True)
 class FrameDescription:
-    """What a user states of a data frame, which has no `NAME.toml` beside it.
+    """Description of a data frame, which has no `NAME.toml` file.
 
     Attributes:
-        system: registered name of the system.
-        model: a robot's model file, in place of a system.
-        units: of columns, by name.
-        constants: known numbers of the system, SI units.
-        description: anything else, with the keys of `NAME.toml`.
+        system: Registered name of the system.
+        model: Path of a robot's model file, instead of a system.
+        units: Units of columns, by name.
+        constants: Known numbers of the system, SI units.
+        description: Any further entries, with the keys of `NAME.toml`.
     """
 
     system: str | None = None
@@ -34,7 +34,7 @@ class FrameDescription:
     description: Mapping[str, Any] = field(default_factory=dict)
 
     def refuse_for_files(self, recording: object) -> None:
-        """Refuse words about a data frame where the recording is none.
+        """Reject a description of a data frame if the recording is not a data frame.
 
         Raises:
             InputError: units, constants or a description are given.
@@ -48,15 +48,15 @@ class FrameDescription:
 
 
 def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame") -> Recording:
-    """The recording in a data frame; nothing is held out but the runs that are marked.
+    """Read the recording in a data frame; only runs that are marked so are held out.
 
     Args:
-        frame: columns ``run`` (where there are several), ``t`` and one for each channel and input.
-        about: what the user states of it.
-        name: what messages call it.
+        frame: Columns ``run`` (if there are several), ``t`` and one for each channel and input.
+        about: Description by the user.
+        name: Name of the recording in messages.
 
     Raises:
-        InputError: anything malformed, in one line.
+        InputError: The data frame or its description is malformed; the message is one line.
     """
     meta = dict(about.description)
     if about.system is not None:
@@ -74,7 +74,7 @@ def recording_of(frame: Frame, about: FrameDescription, name: str = "DataFrame")
 
 
 def _kind(name: str, meta: Mapping[str, Any]) -> type[Simulator]:
-    """The simulator of the system or robot that a description states."""
+    """Return the simulator of the system or robot that a description names."""
     file = model_in(Path(name), meta)
     if file is not None:
         return robot(file.path, file.actuators, file.engine, file.free)

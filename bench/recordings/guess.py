@@ -1,12 +1,13 @@
-"""What the columns of a log may be, told from their names and from a robot's model.
+"""Guess the meaning of log columns from their names and from a robot's model.
 
-Names say most: of a command or of a sensor, of a position, a rate or a force, of which joint. The
-numbers check it: a position lies within its joint's range, in radians or in degrees, and a rate is
-the derivative of its position,
+The names show most: whether a column is a command or a sensor signal; a position, a rate or a
+force; and its joint. The numbers verify it: a position lies within its joint's range, in radians or
+in degrees, and a rate is the derivative of its position,
 
     v = b dq/dt,    b = <v dq/dt> / <(dq/dt)^2>                                                (1)
 
-with b = 1 in the same unit, and 57.3 in degrees beside radians.
+with b = 1 if both have the same unit, and 57.3 if the rate is in degrees and the position in
+radians.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ _WORD_LISTS: Mapping[Role, str] = {
 WORDS: Mapping[Role, frozenset[str]] = {
     role: frozenset(words.split()) for role, words in _WORD_LISTS.items()
 }
-"""Words of a column's name, or of its file's, by what they say it is."""
+"""Words in the name of a column or of its file, by the role that they indicate."""
 _VAGUE = frozenset({"joint", "joints", "state", "states", "current", "currents", "load", "loads"})
-"""Words that say what a column is only where no other word does."""
+"""Words that indicate a role only if no other word does."""
 _MEASURED = frozenset(["meas", "measured", "actual", "act", "present", "sensed", "ist", "istwert"])
-"""Words of what a sensor measured, where a log has several signals of a kind."""
+"""Words for a measured signal, if a log has several signals of one kind."""
 _GLUED = re.compile(r"(?P<what>q|dq|qd|tau|pos|vel)(?P<command>des|cmd|ref|goal|target|desired)")
-"""Words of two, as ``qdes`` and ``taucmd``."""
+"""Pattern of two words written as one, for example ``qdes`` and ``taucmd``."""
 _ROLE_OF_QUANTITY: Mapping[str, Role] = {
     "angular velocity": "velocity",
     "velocity": "velocity",
@@ -58,22 +59,22 @@ _ROLE_OF_QUANTITY: Mapping[str, Role] = {
     "acceleration": "other",
     "other": "other",
 }
-"""What a column is by the quantity that its unit measures."""
+"""Role of a column by the quantity that its unit measures."""
 _TIME_WORDS = "t time times timestamp timestamps stamp stamps sec seconds secs clock zeit uhrzeit"
 TIMES = frozenset((_TIME_WORDS + " temps tiempo tempo").split())
-"""Words of a column of stamps."""
+"""Words in the name of a column of time stamps."""
 UNITS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""What a stamp's unit may be worth, seconds."""
+"""Possible units of time stamps, with their values in seconds."""
 RATES = (2.0, 5000.0)
-"""Hz between which a log is sampled."""
+"""Minimum and maximum sampling rate of a log, in Hz."""
 WIDER = 0.5
-"""Times the width of its range, a position may lie beyond its end."""
+"""Maximum distance of a position beyond its joint's range, as a fraction of the range."""
 TURNS = 4.0 * np.pi
-"""A position of a joint without a range that is larger is taken for degrees."""
+"""Largest position in radians of a joint without a range; a larger one is taken for degrees."""
 ALIKE = 0.7
-"""Correlation of a rate with the derivative of its position, at least."""
+"""Minimum correlation of a rate with the derivative of its position."""
 BETWEEN = (0.7, 1.4)
-"""Slopes of (1) that are one unit, times the unit's own."""
+"""Interval of slopes b of equation (1), divided by a unit's factor, that confirm the unit."""
 DEGREES = 180.0 / np.pi
 
 
@@ -81,10 +82,10 @@ class Column(NamedTuple):
     """A column of a log.
 
     Attributes:
-        file: name of its file.
-        name: as the file has it.
+        file: Name of its file.
+        name: Name in the file.
         values: (T,) numbers.
-        units_row: unit in the file's row of units; empty where it has none.
+        units_row: Unit in the file's row of units; empty if it has none.
     """
 
     file: str
@@ -99,18 +100,18 @@ class Column(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """The unit that the file states; empty where it states none."""
+        """The unit in the file; empty if there is none."""
         return self.units_row or split_unit(self.name).unit
 
     @property
     def quantity(self) -> str:
-        """What the stated unit measures; empty where none is stated."""
+        """The quantity that the stated unit measures; empty if there is no unit."""
         found = read_unit(self.unit) if self.unit else None
         return found[1] if found else ""
 
 
 def words_of(text: str) -> list[str]:
-    """The words of a name: ``jointPositions[2]`` is joint, positions, 2."""
+    """Split a name into words: ``jointPositions[2]`` becomes joint, positions, 2."""
     split = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", text)
     words = []
     for part in re.split(r"[\W_]+|(?<=[^\W\d_])(?=\d)", split):
@@ -120,7 +121,7 @@ def words_of(text: str) -> list[str]:
 
 
 def role_of(column: Column) -> Role | None:
-    """Return what a column is by its name and unit, else by its file's; None if none says it."""
+    """Return the role of a column by its name and unit, else by its file's name, or None."""
     own, file = _words(column)
     if own & WORDS["command"] or (file & WORDS["command"] and not own & WORDS["other"]):
         return "command"
@@ -130,15 +131,16 @@ def role_of(column: Column) -> Role | None:
 
 
 def commanded_role(column: Column) -> Role | None:
-    """Return what a command asks for by its name and unit, else by its file's name: a position, a
-    velocity or a force; None if none says it.
+    """Return the quantity that a command sets: position, velocity or force; None if unknown.
+
+    The column's name and unit are used first, then its file's name.
     """
     if column.quantity in _ROLE_OF_QUANTITY:
         return _ROLE_OF_QUANTITY[column.quantity]
     if column.quantity in ("angle", "length"):
         return "position"
     own, file = _words(column)
-    # `joint_command` says no more than `command`; `joint_position_command` does.
+    # `joint_command` gives no more information than `command`; `joint_position_command` does.
     return _measured(own - _VAGUE) or _measured(file - _VAGUE)
 
 
@@ -148,16 +150,17 @@ def is_measured(column: Column) -> bool:
 
 
 def _words(column: Column) -> tuple[set[str], set[str]]:
-    """The words of a column's name and of its file's."""
-    # A topic of a bag has no ending.
+    """Return the words of a column's name and those of its file's name."""
+    # The name of a bag's topic has no file extension.
     stem = column.file.rpartition(".")[0] or column.file
     return set(words_of(column.bare)), set(words_of(stem))
 
 
 def _measured(words: set[str]) -> Role | None:
-    """What some words say of a measured signal."""
+    """Return the role of a measured signal that some words indicate; None if there is none."""
     roles: tuple[Role, ...] = ("other", "velocity", "force", "position")
-    # The current position is no current, and the state of a joint may be its velocity.
+    # `current` in "current position" is not an electric current, and a joint state may be a
+    # velocity.
     for some in (words - _VAGUE, words & {"current", "currents", "load", "loads"}, words):
         for role in roles:
             if some & WORDS[role]:
@@ -166,7 +169,15 @@ def _measured(words: set[str]) -> Role | None:
 
 
 def joint_of(column: Column, joints: Sequence[Joint]) -> Joint | None:
-    """The joint whose name stands in a column's; the longest where there are several."""
+    """Return the joint whose name is part of a column's name; the longest if there are several.
+
+    Args:
+        column: Column of a log.
+        joints: Joints of the robot.
+
+    Returns:
+        The joint, or None if no name matches.
+    """
     text = _plain(column.bare)
     for names in ([joint.name for joint in joints], _stems(joints)):
         named = [
@@ -180,10 +191,10 @@ def joint_of(column: Column, joints: Sequence[Joint]) -> Joint | None:
 
 
 def _stems(joints: Sequence[Joint]) -> list[str]:
-    """Names of joints without words that all of them may have: ``elbow`` of ``elbow_joint``."""
+    """Return joint names without words that all may share: ``elbow`` for ``elbow_joint``."""
     usual = {"joint", "motor", "link", "actuator", "dof"}
     stems = ["".join(w for w in words_of(joint.name) if w not in usual) for joint in joints]
-    # A short one, or one that two joints share, may be anything.
+    # A short stem, or one that two joints share, is ambiguous.
     return [
         stem if len(stem) > 2 and not stem.isdigit() and stems.count(stem) == 1 else ""
         for stem in stems
@@ -191,8 +202,15 @@ def _stems(joints: Sequence[Joint]) -> list[str]:
 
 
 def numbered(columns: Sequence[Column], joints: Sequence[Joint]) -> dict[str, Joint]:
-    """Joints by number, for columns of one kind that are numbered or stand in a list: as many as
-    the robot has joints, or fewer, in the model's order; none where there are more.
+    """Assign joints to numbered columns of one kind, in the order of the model.
+
+    Args:
+        columns: Columns with a number in their names.
+        joints: Joints of the robot in the order of the model.
+
+    Returns:
+        Joints by column name; empty if a column has no number, numbers repeat, or there are more
+            columns than joints.
     """
     places: dict[str, int] = {}
     for column in columns:
@@ -210,8 +228,10 @@ def numbered(columns: Sequence[Column], joints: Sequence[Joint]) -> dict[str, Jo
 
 
 def clocks(columns: Iterable[Column]) -> list[Column]:
-    """Return the columns that may be stamps, the likeliest first: the stamp of a message's header,
-    others that are called so or have a unit of time, and columns of other names that increase.
+    """Return the columns that may be time stamps, the most likely first.
+
+    The order is: the stamp of a message's header, other columns with a name or unit of time, and
+    increasing columns with other names.
     """
     ranked = []
     for place, column in enumerate(columns):
@@ -224,7 +244,7 @@ def clocks(columns: Iterable[Column]) -> list[Column]:
 
 
 def unit_of_time(stamps: Array) -> str | None:
-    """The unit of stamps whose usual interval is that of a log; None where no unit makes it so."""
+    """Return the unit of time stamps for a plausible sampling rate; None if no unit gives one."""
     steps = np.diff(stamps)
     interval = float(np.median(steps[steps > 0]))
     for unit, second in UNITS.items():
@@ -234,7 +254,15 @@ def unit_of_time(stamps: Array) -> str | None:
 
 
 def unit_of_position(values: Array, joint: Joint) -> str | None:
-    """Rad or deg (m or mm of a slide) by the joint's range; None where neither can be."""
+    """Return the unit of a position, rad or deg (m or mm for a slide joint), by the joint's range.
+
+    Args:
+        values: (T,) positions.
+        joint: Joint that they belong to.
+
+    Returns:
+        The unit, or None if neither fits the range.
+    """
     usual, other, size = ("rad", "deg", DEGREES) if joint.kind == "hinge" else ("m", "mm", 1e3)
     ends = np.array([np.nanmin(values), np.nanmax(values)])
     if joint.range is None:
@@ -246,23 +274,23 @@ def unit_of_position(values: Array, joint: Joint) -> str | None:
 
 
 def _within(ends: Array, limits: tuple[float, float]) -> bool:
-    """Whether a lowest and a highest position lie within a joint's range, or hardly beyond."""
+    """Return whether a lowest and a highest position lie within a joint's widened range."""
     slack = WIDER * (limits[1] - limits[0])
     return bool(limits[0] - slack <= ends[0] and ends[1] <= limits[1] + slack)
 
 
 def unit_of_rate(rate: Array, slope: Array, joint: Joint, stated: str = "") -> str | None:
-    """Return the unit of a rate by (1); None where it is not the derivative of the position.
+    """Return the unit of a rate by equation (1); None if it is not the derivative of the position.
 
     Args:
         rate: (T,) numbers of the rate.
         slope: (T,) derivative of the position, rad/s or m/s.
-        joint: that moves.
-        stated: unit that the log states, which is tried first.
+        joint: Joint that moves.
+        stated: Unit in the log, which is tested first.
     """
     seen = np.isfinite(slope) & np.isfinite(rate)
     r, d = rate[seen], slope[seen]
-    # Differences of an encoder's steps are noise: both are looked at over a few samples.
+    # Differences of an encoder's steps are noisy, so both are averaged over a few samples.
     r, d = _smooth(r), _smooth(d)
     if not (r @ r and d @ d) or abs(float(r @ d)) < ALIKE * float(np.sqrt((r @ r) * (d @ d))):
         return None
@@ -277,7 +305,7 @@ def unit_of_rate(rate: Array, slope: Array, joint: Joint, stated: str = "") -> s
 
 
 def still(values: Array) -> bool:
-    """Whether a column never changes."""
+    """Return whether a column never changes."""
     return bool(np.nanmax(values) == np.nanmin(values))
 
 
@@ -287,7 +315,7 @@ def _smooth(values: Array) -> Array:
 
 
 def _increases(values: Array, repeated: float) -> bool:
-    """Whether a column increases from row to row but for a share of rows that repeat."""
+    """Return whether a column increases from row to row, except for a share of repeated rows."""
     if values.size < 2 or not np.isfinite(values).all():
         return False
     steps = np.diff(values)

@@ -1,4 +1,4 @@
-"""`simgap import`: a description of logs as they lie, every guess in it marked."""
+"""Write a recording description for raw logs (`simgap import`), with every guess marked."""
 
 from __future__ import annotations
 
@@ -35,35 +35,35 @@ from sims.robot.scales import scales
 from sims.user_toml import known, toml_key, toml_text
 
 QUICK, DAMPED = 20.0, 0.7
-"""rad/s and share of critical damping of a servo whose gains nobody has stated or shown."""
+"""Natural frequency in rad/s and damping ratio of a servo whose gains are unknown."""
 _GAINS = "actuator.stiffness", "actuator.damping"
-"""What nobody has stated of a servo that a model file lacks."""
+"""Free numbers of a servo that is missing in the model file."""
 _BY_COMMANDS = "in the order in which positions follow their commands"
-"""Why a column that is numbered is of its joint although the model's order says another one."""
+"""Reason for assigning a numbered column to another joint than the model's order gives."""
 _BY_MODEL = "in the order in which the model explains the motion best"
-"""Why columns without names are of their joints although the model's order is another one."""
+"""Reason for assigning unnamed columns to other joints than the model's order gives."""
 POSITION_UNITS = ("rad", "deg", "normalised")
-"""Units of positions that a user may state; normalised ones are those of LeRobot."""
+"""Units of positions that a user may state; normalised positions are those of LeRobot."""
 _BY_ORDER = "by the model's order of joints"
-"""Why a column that is numbered is of its joint."""
+"""Reason for assigning a numbered column to its joint."""
 FOLLOWS = 0.9
 """Minimum correlation of a motor's command with a position that makes it a desired position."""
 MOST_RUNS = 8
-"""Maximum number of runs in which the largest position is looked for."""
+"""Maximum number of runs in which the largest position is searched."""
 MOST_NAMES = 12
 """Maximum number of names in a line."""
 
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What a user states of logs.
+    """Information about logs that the user states.
 
     Attributes:
-        held_out: runs that no fit is to see.
-        rate: of the rows, Hz, where the logs have no stamps.
-        position_unit: of positions and their commands, one of `POSITION_UNITS`; empty where it is
-            to be told from the joints' ranges.
-        calibration: calibration file of LeRobot; None to look for it beside the dataset.
+        held_out: Names of the runs that are held out.
+        rate: Rate of the rows in Hz, if the logs have no time stamps.
+        position_unit: Unit of positions and their commands, one of `POSITION_UNITS`; empty to
+            derive it from the joints' ranges.
+        calibration: Calibration file of LeRobot; None to search it in the folder of the dataset.
     """
 
     held_out: Collection[str] = ()
@@ -74,13 +74,13 @@ class ImportOptions:
 
 @dataclass
 class Imported:
-    """What has been made of logs.
+    """Description of logs, with its guesses and warnings.
 
     Attributes:
-        text: the description.
-        guessed: what was guessed, a line each.
-        untold: what could not be told, a line each.
-        checks: what the user has to check before the description is used, a line each.
+        text: The description in TOML.
+        guessed: Guesses, one line each.
+        untold: Columns, files and stamps that were left out and why, one line each.
+        checks: What the user must check before using the description, one line each.
     """
 
     text: str
@@ -94,11 +94,11 @@ class Signal:
     """The column of a channel or an input.
 
     Attributes:
-        column: of the log.
-        unit: of its numbers, after scale and offset.
-        why: by what it was told.
-        scale: by which its numbers are multiplied.
-        offset: added after that.
+        column: Column of the log.
+        unit: Unit of its numbers, after scale and offset.
+        why: Reason for the assignment.
+        scale: Factor by which its numbers are multiplied.
+        offset: Offset that is added after that.
     """
 
     column: Column
@@ -108,7 +108,12 @@ class Signal:
     offset: float = 0.0
 
     def si(self, unit: str, values: Array) -> Array:
-        """Convert numbers of the column to an SI unit."""
+        """Convert numbers of the column to an SI unit.
+
+        Args:
+            unit: SI unit of the result.
+            values: (T,) numbers of the column.
+        """
         own = scale(self.unit, unit)
         converted: Array = own.gain * (self.scale * values + self.offset) + own.offset
         return converted
@@ -124,14 +129,14 @@ def describe(
     """Describe logs of a robot.
 
     Args:
-        logs: files of one run, folders that each hold those of one, or datasets of LeRobot.
-        robot: what they are of.
-        model: its model file.
-        beside: the folder where the description will stand.
-        options: what the user states of them.
+        logs: Files of one run, folders with the files of one run each, or datasets of LeRobot.
+        robot: Robot that was recorded.
+        model: Its model file.
+        beside: Folder in which the description will be written.
+        options: Information that the user states.
 
     Raises:
-        InputError: they cannot be read, there is nothing in them that a robot has, or no such run.
+        InputError: A log cannot be read, no column is a joint's position, or a run is unknown.
     """
     options = options or ImportOptions()
     known("position unit", [options.position_unit] * bool(options.position_unit), POSITION_UNITS)
@@ -143,10 +148,14 @@ def describe(
 
 
 def checked(path: Path, text: str) -> None:
-    """Write a description, and read what it describes; what cannot be read is not left there.
+    """Write a description and read the recording; delete the description if that fails.
+
+    Args:
+        path: Path of the description.
+        text: Its content.
 
     Raises:
-        InputError: it cannot be written, or read.
+        InputError: It cannot be written, or read.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -184,7 +193,7 @@ class _Describing:
         self._read: dict[Path, Log] = {}
 
     def made(self) -> Imported:
-        """The description."""
+        """Build the description."""
         logs = self._logs()
         columns = self._timed(logs)
         self._say_normalised(columns)
@@ -207,10 +216,10 @@ class _Describing:
     # -- files and stamps
 
     def _logs(self) -> dict[str, Log]:
-        """The logs of the first run by name; those of a folder that cannot be read are left out.
+        """Read the logs of the first run, by name; leave out unreadable logs of a folder.
 
         Raises:
-            InputError: a file that the user named cannot be read, or none can.
+            InputError: A file that the user named cannot be read, or no file can.
         """
         files = next(iter(self.runs.values()))
         logs: dict[str, Log] = {}
@@ -232,7 +241,7 @@ class _Describing:
         return logs
 
     def _no_header(self, log: Log) -> InputError:
-        """What to say of a table whose first row are numbers."""
+        """Make the error for a table whose first row contains numbers."""
         count = len(log.names())
         names = ["t", *(f"{joint.name}_pos" for joint in self.joints)]
         shown = ",".join(names[:MOST_NAMES])
@@ -246,12 +255,16 @@ class _Describing:
         self.made_of.untold.append(f"{name}: {text}; left out")
 
     def _timed(self, logs: dict[str, Log]) -> list[Column]:
-        """The columns of all files that have stamps of one name and unit, stamps left out."""
+        """Return the columns of all files whose time stamps have a common name and unit.
+
+        The columns of time stamps are not included.
+        """
         if self.options.rate is not None:
             return self._at_rate(logs, self.options.rate)
         clocks = self._clocks(logs)
         names = [{column.name for column, _ in own} for own in clocks.values()]
-        # One name that all files have, if there is one: what a header says before when it came.
+        # Prefer a name that all files share: the stamp in a message's header over its time of
+        # arrival.
         common = set.intersection(*names) if names else set()
         chosen = {
             file: next((pair for pair in own if pair[0].name in common), own[0])
@@ -268,7 +281,8 @@ class _Describing:
             if (column.name, unit) != (self.time, self.unit):
                 self._other_clock(file, logs[file], f"{column.name} ({unit})")
                 continue
-            # Clocks of robots count from 1970: what is left of a second there is coarse.
+            # Robot clocks often count from 1970, and floats of that size resolve fractions of a
+            # second coarsely, so the first stamp is subtracted before scaling.
             own = column.values - column.values[0]
             self.seconds[file] = guess.UNITS[unit] * own
             self._starts[file] = guess.UNITS[unit] * float(column.values[0] - zero)
@@ -284,7 +298,7 @@ class _Describing:
         return self._with_numbers(logs)
 
     def _at_rate(self, logs: dict[str, Log], rate: float) -> list[Column]:
-        """The columns of all files whose rows are at a rate that the user states."""
+        """Return the columns of all files whose rows have the rate that the user states."""
         for file, log in logs.items():
             count = max(log.column(name).size for name in log.names())
             self.seconds[file] = np.arange(count) / rate
@@ -292,10 +306,10 @@ class _Describing:
         return self._with_numbers(logs)
 
     def _clocks(self, logs: dict[str, Log]) -> dict[str, list[tuple[Column, str]]]:
-        """Of each file the columns that may be its stamps, with their units.
+        """Return for each file the columns that may be its time stamps, with their units.
 
         Raises:
-            InputError: a file that the user named has none, or none has.
+            InputError: A file that the user named has no such column, or no file has one.
         """
         found: dict[str, list[tuple[Column, str]]] = {}
         faults: list[InputError] = []
@@ -328,16 +342,16 @@ class _Describing:
 
     @staticmethod
     def _unit_of_time(column: Column) -> str | None:
-        """The unit of stamps: as the file states it, else the one that makes them a log's."""
+        """Return the unit of time stamps: as in the file, else the one with a plausible rate."""
         if column.quantity == "time" and column.unit in guess.UNITS:
             return column.unit
         return guess.unit_of_time(column.values)
 
     def _other_clock(self, file: str, log: Log, clock: str) -> None:
-        """Leave out a file whose stamps have another name or unit than those of the others.
+        """Leave out a file whose time stamps have another name or unit than the other files.
 
         Raises:
-            InputError: the user named it.
+            InputError: The user named the file.
         """
         error = InputError(
             f"{log.path}: its stamps are called {clock}, those of the files before "
@@ -349,7 +363,7 @@ class _Describing:
 
     @staticmethod
     def _columns(file: str, log: Log) -> list[Column]:
-        """All columns of numbers of a log."""
+        """Return all numeric columns of a log."""
         columns = []
         for name in log.names():
             values = log.column(name)
@@ -358,7 +372,7 @@ class _Describing:
         return columns
 
     def _with_numbers(self, logs: dict[str, Log]) -> list[Column]:
-        """The columns of the files with stamps that have a number for each of these."""
+        """Return the columns that have one number for each time stamp of their file."""
         columns = []
         for file, seconds in self.seconds.items():
             for column in self._columns(file, logs[file]):
@@ -375,7 +389,7 @@ class _Describing:
     # -- columns
 
     def _by_joint(self, columns: Sequence[Column]) -> list[tuple[Column, Joint, str]]:
-        """Columns of one kind with their joints, and why."""
+        """Return columns of one kind with their joints and the reasons for the assignment."""
         found = []
         plain = []
         for column in columns:
@@ -395,13 +409,13 @@ class _Describing:
         return found
 
     def _say_normalised(self, columns: Sequence[Column]) -> None:
-        """Tell whether positions are normalised, and say what cannot be told."""
+        """Decide whether positions are normalised, and report if it cannot be decided."""
         mine = [c for c in columns if guess.role_of(c) in ("position", None) and not c.unit]
         placed = [(c, j) for c, j, _ in self._by_joint(mine)]
         if not placed:
             return
         path = next(iter(self.runs.values())).paths[0]
-        # An episode has one log; other runs may hold larger positions than the first.
+        # An episode has one log; other runs may contain larger positions than the first.
         largest = max(self._largest(c) for c, _ in placed)
         options = self.options
         self.normalised = normalised_positions(
@@ -421,7 +435,7 @@ class _Describing:
             )
 
     def _largest(self, column: Column) -> float:
-        """The largest magnitude of a column in some runs."""
+        """Return the largest magnitude of a column in the first runs."""
         values = [float(np.nanmax(np.abs(column.values)))]
         for run in list(self.runs)[1:MOST_RUNS]:
             paths = [p for p in self.runs[run].paths if self.runs[run].name(p) == column.file]
@@ -430,7 +444,7 @@ class _Describing:
         return max(values)
 
     def _position_signal(self, column: Column, joint: Joint, why: str) -> Signal | None:
-        """A position, or the command of one, in the unit that is stated or that its range tells."""
+        """Assign the unit of a position or position command, as stated or by the joint's range."""
         if column.unit:
             if not _converts(column.unit, joint.unit):
                 what = "expected an angle" if joint.kind == "hinge" else "expected a length"
@@ -480,7 +494,7 @@ class _Describing:
                 self._command(column, joint, why, own)
 
     def _command_of_none(self, column: Column, joint: Joint, why: str) -> None:
-        """The command of a joint that the model does not drive: of a servo, or a force."""
+        """Add a command of a joint that the model does not drive: a servo command or a force."""
         asks = guess.commanded_role(column)
         if asks == "force":
             self._force(column, joint, f"force.{joint.name}", why)
@@ -493,7 +507,7 @@ class _Describing:
             self._untold(column, f"asks for a {asks} of {joint.name}, which no actuator takes")
 
     def _command(self, column: Column, joint: Joint, why: str, own: Actuator) -> None:
-        """The command of an actuator, if it asks for what the actuator takes."""
+        """Add the command of an actuator if its quantity is the one that the actuator takes."""
         asks = guess.commanded_role(column)
         takes = {"motor": "force", "position": "position", "velocity": "velocity"}.get(own.kind)
         if own.kind == "motor" and asks is None and self._follows(column, joint):
@@ -513,7 +527,7 @@ class _Describing:
             self._take(f"u.{own.name}", Signal(column, unit, f"{why}; in {unit}"))
 
     def _follows(self, column: Column, joint: Joint) -> bool:
-        """Whether a command is like the position of its joint, as a desired position is."""
+        """Return whether a command resembles its joint's position, as a desired position does."""
         there = self.channels.get(f"q.{joint.name}")
         if there is None:
             return False
@@ -522,12 +536,12 @@ class _Describing:
         u, q = u[seen], q[seen]
         if u.size < 3 or np.ptp(u) == 0 or np.ptp(q) == 0:
             return False
-        # A torque may follow a position, too, but not its mean and its size.
+        # A torque may also correlate with a position, but does not share its mean and size.
         apart = float(np.sqrt(np.mean((u - q) ** 2)))
         return bool(np.corrcoef(u, q)[0, 1] > FOLLOWS and apart < 0.5 * float(np.std(q)))
 
     def _force(self, column: Column, joint: Joint, name: str, why: str) -> None:
-        """A torque of a motor, or along a joint."""
+        """Add the torque of a motor, or a force along a joint."""
         unit = column.unit or joint.force_unit
         if not _converts(unit, joint.force_unit):
             self._untold(column, f"is in {unit}, expected {joint.force_unit}")
@@ -536,7 +550,7 @@ class _Describing:
         self._take(name, Signal(column, unit, f"{why}; in {unit}, {by}"))
 
     def _new_input(self, name: str, column: Column, joint: Joint, why: str) -> Signal | None:
-        """The command of a servo's position."""
+        """Add the command of a position servo."""
         if name in self.inputs:
             self._untold(column, f"{name} is {self.inputs[name].column.name} already")
             return None
@@ -546,7 +560,7 @@ class _Describing:
         return signal
 
     def _take(self, name: str, signal: Signal) -> None:
-        """An input, unless there is one of that name."""
+        """Add an input unless one with this name exists."""
         if name in self.inputs:
             self._untold(signal.column, f"{name} is {self.inputs[name].column.name} already")
         else:
@@ -555,10 +569,10 @@ class _Describing:
     # -- order of joints
 
     def _order(self) -> dict[str, str]:
-        """Check each position against its command where the order of joints is a guess.
+        """Check each position against its command if the order of joints is a guess.
 
         Returns:
-            By joint, the joint of whose place its column is, where positions were exchanged.
+            For each joint, the joint at whose index its column is, if positions were exchanged.
         """
         servos = {
             joint.name: name
@@ -575,7 +589,7 @@ class _Describing:
                 self._held(command.column, position.column)
                 for command, position in zip(commands, positions, strict=True)
             ]
-            # All positions of a file have the same instants; those of several may not.
+            # Positions of one file share their sample times; those of several files may not.
             if len({u.size for u, _ in held}) == 1:
                 units = [self.robot.joint(joint).unit for joint in joints]
                 u = [c.si(unit, v) for c, unit, (v, _) in zip(commands, units, held, strict=True)]
@@ -592,7 +606,7 @@ class _Describing:
         return {}
 
     def _servo(self, joint: Joint) -> str:
-        """The input of the position servo of a joint; empty where it has none."""
+        """Return the input of a joint's position servo; empty if it has none."""
         own = self.drives.get(joint.name)
         if own is not None:
             return f"u.{own.name}" if own.kind == "position" else ""
@@ -606,7 +620,7 @@ class _Describing:
         commands: Sequence[Array],
         positions: Sequence[Array],
     ) -> dict[str, str]:
-        """Exchange columns whose order is a guess, if positions follow the commands better then."""
+        """Exchange columns whose order is a guess if positions then follow the commands better."""
         order = order_of_commands(commands, positions)
         if order is None or not (all(guessed[0]) or all(guessed[1])):
             return {}
@@ -632,10 +646,11 @@ class _Describing:
         commands: Sequence[Array],
         positions: Sequence[Array],
     ) -> dict[str, str]:
-        """Exchange columns without names if the model explains the motion far better then.
+        """Exchange unnamed columns if the model then explains the motion far better.
 
         Returns:
-            By joint, the joint of whose place its column is; nothing where the order stays.
+            For each joint, the joint at whose index its column is; empty if the order is not
+                changed.
         """
         drives = [self.drives.get(joint) for joint in joints]
         driven = [
@@ -643,7 +658,7 @@ class _Describing:
             for joint, drive in zip(joints, drives, strict=True)
             if drive is not None
         ]
-        # Gains that nobody knows explain nothing, and normalised numbers belong to their joints.
+        # Unknown gains explain nothing, and normalised numbers belong to their joints.
         if len(driven) < len(joints) or self.normalised is not None:
             return {}
         if all(map(self._has_its_number, joints)):
@@ -669,12 +684,11 @@ class _Describing:
         return moved
 
     def _say_order(self, joints: Sequence[str], follows: bool) -> None:
-        """Say whether positions follow their commands, and that an order is a guess where nothing
-        but the model's order tells it.
+        """Report which positions follow their commands, and which joint orders are a guess.
 
         Args:
-            joints: with a servo, a command and a position.
-            follows: whether each of these positions follows the command of its own joint.
+            joints: Joints with a servo, a command and a position.
+            follows: Whether each of these positions follows the command of its own joint.
         """
         guessed: dict[str, set[str]] = {}
         for table in (self.channels, self.inputs):
@@ -686,7 +700,8 @@ class _Describing:
                     table[name] = replace(signal, why=told)
                 guessed.setdefault(name.partition(".")[0], set()).add(self._driven(name))
         positions, commands = guessed.get("q", set()), guessed.get("u", set())
-        # What follows a command that its log names, or is followed by a named position, is told.
+        # A position that follows a named command, and a command that a named position follows, are
+        # certain.
         if follows and not (positions & commands):
             return
         doubted = positions | commands
@@ -703,14 +718,14 @@ class _Describing:
         )
 
     def _driven(self, signal: str) -> str:
-        """The joint of a channel or an input; its own name where it has none."""
+        """Return the joint of a channel or an input; the signal's own name if it has none."""
         name = signal.partition(".")[2]
         own = next((a.joint for a in self.robot.actuators if a.name == name), None)
         added = self.added.get(name)
         return own or (added.name if added is not None else name)
 
     def _has_its_number(self, joint: str) -> bool:
-        """Whether the number of a position's column stands in its joint's name."""
+        """Return whether the number in the column's name equals the number in the joint's name."""
         own, column = (
             [int(digits) for digits in re.findall(r"\d+", text)]
             for text in (joint, self._column_of(joint))
@@ -718,7 +733,7 @@ class _Describing:
         return bool(own and column and own[-1] == column[-1])
 
     def _column_of(self, joint: str) -> str:
-        """The name of the column of a joint's position, or else of its command."""
+        """Return the column name of a joint's position, or else of its command."""
         position = self.channels.get(f"q.{joint}")
         if position is not None and _BY_ORDER in position.why:
             return position.column.bare
@@ -726,7 +741,7 @@ class _Describing:
         return next((signal.column.bare for signal in own), "")
 
     def _held(self, command: Column, position: Column) -> tuple[Array, Array]:
-        """(T,) a command at the instants of a position, each held until the next, and that."""
+        """Return (T,) a command at the times of a position (zero-order hold), and that position."""
         u, q = self.seconds[command.file], self.seconds[position.file]
         if command.file == position.file:
             return command.values, position.values
@@ -757,7 +772,7 @@ class _Describing:
                 self._rate(column, joint, why, position)
 
     def _rate(self, column: Column, joint: Joint, why: str, position: Signal) -> None:
-        """A velocity, if it is the derivative of its position and not behind it."""
+        """Add a velocity if it is the derivative of its position and does not lag it."""
         name, seconds = position.column.name, self.seconds[column.file]
         stated = column.unit if _converts(column.unit, f"{joint.unit}/s") else ""
         first = np.diff(seconds, prepend=-np.inf) > 0
@@ -781,7 +796,7 @@ class _Describing:
         )
 
     def _efforts(self, columns: Sequence[Column]) -> None:
-        """Measured torques as inputs where nothing commands a motor, or a joint without drive."""
+        """Add measured torques as inputs of motors without a command and of undriven joints."""
         mine = [c for c in columns if guess.role_of(c) == "force" and _is_torque(c)]
         torques: dict[str, list[tuple[Column, Joint, str]]] = {}
         for column, joint, why in self._by_joint(mine):
@@ -796,19 +811,19 @@ class _Describing:
                 torques.setdefault(name, []).append((column, joint, why))
         for name, found in torques.items():
             measured = [one for one in found if guess.is_measured(one[0])]
-            # What a controller asked for and what friction took may be torques of a log, too.
+            # A log may also contain a controller's desired torque and a friction estimate.
             if len(found) > 1 and len(measured) != 1:
                 continue
             ((column, joint, why),) = measured if len(found) > 1 else found
             self._force(column, joint, name, f"{why}, measured, as nothing commands it")
 
-    # -- what is said
+    # -- messages
 
     def _untold(self, column: Column, why: str) -> None:
         self.made_of.untold.append(f"{column.file}, column {column.name}: {why}; left out")
 
     def _say_inputs(self, columns: Sequence[Column]) -> None:
-        """Say which actuators, or joints, get no input."""
+        """Report which actuators or joints have no input."""
         idle = [a for a in self.robot.actuators if f"u.{a.name}" not in self.inputs]
         if self.inputs and not idle:
             return
@@ -831,7 +846,7 @@ class _Describing:
         self.made_of.checks.append(f"{what}; {columns_}add {table} with file, column and unit")
 
     def _say_rest(self, columns: Sequence[Column]) -> None:
-        """Columns of which nothing has been said."""
+        """Report the columns that were neither used nor mentioned before."""
         signals = (*self.channels.values(), *self.inputs.values())
         used = {(s.column.file, s.column.name) for s in signals}
         said = " ".join(self.made_of.untold)
@@ -876,7 +891,7 @@ class _Describing:
         return "\n".join(lines).rstrip("\n") + "\n"
 
     def _signal_lines(self, kind: str, name: str, signal: Signal) -> list[str]:
-        """The table of a channel or an input."""
+        """Return the lines of the description for a channel or an input."""
         column = signal.column
         lines = [f"[{kind}.{toml_text(name)}]  # guess: {signal.why}"]
         first = next(iter(self.runs.values()))
@@ -894,7 +909,7 @@ class _Describing:
         return [*lines, ""]
 
     def _actuator(self, name: str, joint: Joint) -> list[str]:
-        """A servo whose gains nobody knows."""
+        """Return the lines of the description for a servo with unknown gains."""
         inertia = scales(self.robot).inertia[self.joints.index(joint)]
         found = self._following(name, joint)
         quick, damped = found or (QUICK, DAMPED)
@@ -909,7 +924,7 @@ class _Describing:
         return [*lines, f"kp = {kp:.4g}  # guess", f"kv = {kv:.4g}  # guess", ""]
 
     def _following(self, name: str, joint: Joint) -> Following | None:
-        """How a joint follows the command of its servo, over all runs."""
+        """Estimate how a joint follows the command of its servo, over all runs."""
         u, q = self.inputs[f"u.{name}"], self.channels.get(f"q.{joint.name}")
         if q is None:
             return None
@@ -925,7 +940,7 @@ class _Describing:
         return following(shown)
 
     def _signal(self, run: str, column: Column) -> tuple[Array, Array] | None:
-        """Stamps in s and values of a column in one run; None where it lacks the file or that."""
+        """Return time stamps in s and values of a column in one run; None if it is missing."""
         files = self.runs[run]
         paths = files.paths
         if not files.alone:
@@ -943,7 +958,7 @@ class _Describing:
         return guess.UNITS[self.unit] * log.column(self.time), values
 
     def _log(self, path: Path) -> Log:
-        """A log, read once."""
+        """Read a log; each file is read only once."""
         if path not in self._read:
             self._read[path] = read_log(path)
         return self._read[path]
@@ -956,7 +971,7 @@ class _Describing:
 
 
 def _is_torque(column: Column) -> bool:
-    """Whether a measured column is a torque or a force rather than a current or a load."""
+    """Return whether a measured column is a torque or force rather than a current or a load."""
     if column.unit:
         return column.quantity in ("torque", "force")
     vague = {"current", "currents", "load", "loads", "strom"}
@@ -964,7 +979,7 @@ def _is_torque(column: Column) -> bool:
 
 
 def _converts(unit: str, target: str) -> bool:
-    """Whether a unit converts to another one."""
+    """Return whether a unit converts to another one."""
     try:
         scale(unit, target)
     except InputError:

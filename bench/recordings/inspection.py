@@ -1,4 +1,4 @@
-"""What is in a recording: runs, rates, gaps, ranges, noise; as text and as a figure."""
+"""Summarise a recording as text: runs, rates, gaps, ranges and noise."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from sims.recording.description import ModelFile, model_of
 from sims.recording.recording import Recording, Run, divided, read_recording, system_of
 
 _MOST_RUNS = 40
-"""Runs that are listed."""
+"""Maximum number of runs that are listed."""
 _MOST_NAMES = 12
-"""Runs that are named in one line."""
+"""Maximum number of runs that are named in one line."""
 _CAVEAT = (
     "estimated: from second and third differences, white noise assumed; coloured noise makes it "
     "too small, motion that is fast against the sampling too large"
@@ -45,18 +45,21 @@ def load(
     free: Sequence[str] = (),
     divide: bool = True,
 ) -> tuple[Recording, type[Simulator]]:
-    """A recording, and the simulator of the system it is of (or of `system`, or of `model`).
+    """Read a recording and find its simulator.
 
     Args:
-        source: the table's path, or a recording that is in memory already.
-        system: take it for this system, whatever it says of itself.
-        model: take it for this robot: a model file.
-        free: numbers of a robot's model file that are tuned; those of its description without.
-        divide: divide the runs for fitting and validation as `simgap explain` does; False to hold
-            out marked runs only.
+        source: Path of the table, or a recording in memory.
+        system: Registered system to use instead of the one that the recording names.
+        model: Model file of a robot to use instead of the one that the recording names.
+        free: Numbers of a robot's model file to tune; empty for those of the description.
+        divide: Whether to divide the runs for fitting and validation as `simgap explain` does;
+            False to hold out marked runs only.
+
+    Returns:
+        The recording, and the simulator class of its system.
 
     Raises:
-        InputError: it cannot be read, or there is no such system.
+        InputError: It cannot be read, or there is no such system.
     """
     path = source.path if isinstance(source, Recording) else Path(source)
     kind = kind_of(source, path, system, model, free)
@@ -75,7 +78,18 @@ def kind_of(
     model: str | Path | None = None,
     free: Sequence[str] = (),
 ) -> type[Simulator]:
-    """The simulator of the system or robot that a recording is of; arguments as those of `load`."""
+    """Find the simulator of the system or robot of a recording.
+
+    Args:
+        source: Path of the table, or a recording in memory.
+        path: Path of the table.
+        system: Registered system to use instead of the one that the recording names.
+        model: Model file of a robot to use instead of the one that the recording names.
+        free: Numbers of a robot's model file to tune; empty for those of the description.
+
+    Raises:
+        InputError: A system and a model file are both given, or the system is unknown.
+    """
     if system is not None and model is not None:
         raise InputError("expected a system or a model file, found both; leave one out")
     if isinstance(source, Recording):
@@ -94,10 +108,10 @@ def kind_of(
 
 
 def refuse_huge(recording: Recording) -> None:
-    """Refuse values of which no square is a number any more.
+    """Reject values whose squares overflow.
 
     Raises:
-        InputError: there is one, in one line.
+        InputError: There is such a value; the message is one line.
     """
     for run in recording.runs:
         for name, values in (*run.channels.items(), *run.inputs.items()):
@@ -108,13 +122,18 @@ def refuse_huge(recording: Recording) -> None:
 
 
 def summary(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
-    """Lines that say what is in the recording."""
+    """Yield the lines of a text summary of a recording.
+
+    Args:
+        recording: Recording to summarise.
+        kind: Simulator class of its system.
+    """
     runs = recording.runs
     samples = sum(run.times.size for run in runs)
     seconds = sum(run.times[-1] - run.times[0] for run in runs)
     held_out = len(recording.held_out())
     yield recording.title
-    # One run alone is divided: then two parts have one name.
+    # A single run is divided into two parts with the same name.
     whole = len({run.name for run in runs})
     held = "its last third held out" if whole < len(runs) else f"{held_out} held out"
     if recording.folds():
@@ -183,7 +202,7 @@ def _constants(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
 
 
 def _constant(recording: Recording, name: str, default: float, unit: str) -> str:
-    """What a constant is, and in which runs where it differs."""
+    """Describe a constant's value, and list the runs with each value if it differs."""
     usual = recording.constants.get(name, default)
     runs_by_value: dict[float, list[str]] = {}
     for run in recording.runs:
@@ -209,7 +228,7 @@ def _count(number: int, what: str) -> str:
 
 
 def _aligned(rows: Sequence[Sequence[str]], left: int) -> Iterator[str]:
-    """Columns, the first `left` of them to the left."""
+    """Align a table as text, with the first `left` columns left-justified."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         cells = zip(row, widths, strict=True)

@@ -1,4 +1,4 @@
-"""Several recordings of one system as one, each run with the log that it is of."""
+"""Join several recordings of one system into one; each run keeps the name of its log."""
 
 from __future__ import annotations
 
@@ -20,15 +20,25 @@ def load_all(
     free: Sequence[str] = (),
     prepared: Callable[[Recording, type[Simulator]], Recording] | None = None,
 ) -> tuple[Recording, type[Simulator]]:
-    """Recordings as one, and the simulator that they are of; arguments as those of `load`, and
-    what is made of each recording before its runs are divided.
+    """Read several recordings, join them into one, and find their simulator.
 
-    Two or three unmarked runs in all are cross-validated; else each recording holds out what it
-    would hold out alone, a run at least. A constant that they state differently is one of their
-    runs; a noise that they state differently is the root of the mean of its squares.
+    Two or three unmarked runs in total are cross-validated; otherwise each recording holds out the
+    runs that it would hold out alone, at least one. A constant that the recordings state
+    differently becomes a constant of the runs; a noise that they state differently is replaced by
+    its root mean square.
+
+    Args:
+        sources: Paths of the tables, or recordings in memory.
+        system: Registered system to use instead of the one that the recordings name.
+        model: Model file of a robot to use instead of the one that the recordings name.
+        free: Numbers of a robot's model file to tune; empty for those of the description.
+        prepared: Function applied to each recording before its runs are divided.
+
+    Returns:
+        The joined recording, and the simulator class of its system.
 
     Raises:
-        InputError: one cannot be read, or they are not of one system with the same channels.
+        InputError: One cannot be read, or they are not of one system with the same channels.
     """
     loaded = [load(source, system, model, free, divide=False) for source in sources]
     if prepared is not None:
@@ -81,7 +91,7 @@ def _constant(key: str, recording: Recording, run: Run, usual: dict[str, float])
 def _refuse_other(
     first: Recording, kind: type[Simulator], other: Recording, of: type[Simulator]
 ) -> None:
-    """Refuse what cannot be one recording with the first."""
+    """Reject a recording that cannot be joined with the first one."""
     robots = kind.has_model and of.has_model
     if (kind.has_model or of.has_model) != robots or of.name != kind.name:
         raise InputError(
@@ -106,7 +116,7 @@ def _refuse_other(
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """A short name for each log: its stem, with its folder where stems are alike."""
+    """Return a short name for each log: its stem, with its folder if stems repeat."""
     stems = [path.stem for path in paths]
     if len(set(stems)) == len(stems):
         return stems
@@ -117,7 +127,7 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 
 
 def _noise(recordings: Sequence[Recording]) -> dict[str, float]:
-    """Noise that all of them state."""
+    """Return the root mean square noise of each channel, if all recordings state it."""
     shared = set(recordings[0].noise).intersection(*(r.noise for r in recordings))
     return {
         name: float(np.sqrt(np.mean([recording.noise[name] ** 2 for recording in recordings])))

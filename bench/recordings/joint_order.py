@@ -1,12 +1,12 @@
-"""Which column is of which joint where a log does not say it: servos' joints follow their commands,
-so a position is that of the joint whose command it stays closest to.
+"""Find the joint of each column of a log without joint names.
 
-With the commands u_i and the positions q_j of a run, both in SI units, the order of the columns is
-the permutation p that makes the root mean square distance
+Joints with position servos follow their commands, so a position belongs to the joint whose command
+it is closest to. With the commands u_i and the positions q_j of a run, both in SI units, the order
+of the columns is the permutation p that minimises the root mean square distance
 
     d(p) = sqrt(sum_i mean((u_i - q_p(i))^2))                                                    (1)
 
-least (H. W. Kuhn, Naval Research Logistics 2, 83, 1955).
+(linear assignment; H. W. Kuhn, Naval Research Logistics 2, 83, 1955).
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ import numpy as np
 from sims.base import Array
 
 MAX_DISTANCE_RATIO = 0.5
-"""Maximum of (1) for another order over (1) for the order as it is, at which the other is taken."""
+"""Maximum ratio of distances (1), another order over the present one, for changing the order."""
 MIN_SAMPLES = 20
-"""Minimum number of samples from which an order is told."""
+"""Minimum number of samples for determining an order."""
 
 
 def order_of_commands(commands: Sequence[Array], positions: Sequence[Array]) -> list[int] | None:
     """Find the order of positions that follows commands best.
 
     Args:
-        commands: (T,) of each joint, SI units.
-        positions: (T,) of each joint at the same instants, SI units.
+        commands: (T,) command of each joint, SI units.
+        positions: (T,) position of each joint at the same times, SI units.
 
     Returns:
-        For each command the place of the position that follows it; None where the order as it is
-        follows about as well, or the motion tells nothing.
+        For each command the index of the position that follows it; None if the present order
+            follows about as well, or the motion is not informative.
     """
     distances = _distances(commands, positions)
     if distances is None:
@@ -47,7 +47,12 @@ def order_of_commands(commands: Sequence[Array], positions: Sequence[Array]) -> 
 
 
 def follow(commands: Sequence[Array], positions: Sequence[Array]) -> bool:
-    """Return whether each position is closer to its own command than to any other one."""
+    """Return whether each position is closer to its own command than to any other one.
+
+    Args:
+        commands: (T,) command of each joint, SI units.
+        positions: (T,) position of each joint at the same times, SI units.
+    """
     distances = _distances(commands, positions)
     if distances is None:
         return False
@@ -55,7 +60,7 @@ def follow(commands: Sequence[Array], positions: Sequence[Array]) -> bool:
 
 
 def least_order(distances: Array) -> list[int]:
-    """Return the order that makes (1) least, by linear assignment.
+    """Return the order that minimises (1), by linear assignment.
 
     Args:
         distances: (J, J) mean square distance of each command (rows) from each position (columns).
@@ -69,8 +74,9 @@ def least_order(distances: Array) -> list[int]:
 
 
 def _distances(commands: Sequence[Array], positions: Sequence[Array]) -> Array | None:
-    """Return the mean square distance (J, J) of each command from each position; None where the
-    motion is too short, or of one joint.
+    """Return the (J, J) mean square distance of each command from each position.
+
+    Returns None if the motion is too short, or of one joint only.
     """
     u, q = np.array(commands), np.array(positions)
     finite = np.isfinite(u).all(axis=0) & np.isfinite(q).all(axis=0)

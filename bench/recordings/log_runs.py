@@ -1,4 +1,4 @@
-"""Which of the logs that a user names are of which run."""
+"""Assign the logs that a user names to runs."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from sims.recording.lerobot import is_dataset
 from sims.recording.logs import FORMATS, logs_in, read_log
 
 TABLES = tuple(ending for ending in FORMATS if ending not in (".txt", ".dat"))
-"""Endings of what is taken from a folder; other texts may be anything."""
+"""File extensions of logs that are read from a folder; other text files may contain anything."""
 
 
 class RunFiles(NamedTuple):
     """The logs of one run.
 
     Attributes:
-        folder: the folder, or the bag, that they are in.
-        paths: of the logs.
-        alone: whether the run is one file among others of its folder that are runs, too.
-        chosen: whether the user named the files: then each of them has to be readable.
+        folder: Folder or bag that contains the logs.
+        paths: Paths of the logs.
+        alone: Whether the run is one file of a folder whose other files are runs as well.
+        chosen: Whether the user named the files; then each of them must be readable.
     """
 
     folder: Path
@@ -32,17 +32,18 @@ class RunFiles(NamedTuple):
     chosen: bool = False
 
     def name(self, path: Path) -> str:
-        """Return what a description calls a log."""
+        """Return the name of a log in a description."""
         return path.relative_to(self.folder).as_posix()
 
 
 def runs_of(logs: Sequence[Path]) -> dict[str, RunFiles]:
-    """Return logs by run: those of each folder, bag or episode, or the files themselves.
+    """Group logs by run: those of each folder, bag or episode, or the files themselves.
 
-    Files of one folder are one run, unless all of them have the same columns: then each is a run.
+    The files of one folder are one run, unless all of them have the same columns: then each file is
+    a run.
 
     Raises:
-        InputError: there is no log.
+        InputError: There is no log.
     """
     files = [path for path in logs if not path.is_dir() and not is_bag(path)]
     runs: dict[str, RunFiles] = {}
@@ -78,7 +79,7 @@ def runs_of(logs: Sequence[Path]) -> dict[str, RunFiles]:
 
 
 def _one_run_a_group(run: RunFiles) -> dict[str, RunFiles]:
-    """Return a run for each group of one HDF5 file that has one for each; nothing otherwise."""
+    """Return a run for each group of an HDF5 file with several runs; otherwise an empty dict."""
     if len(run.paths) != 1 or not is_hdf5(run.paths[0]):
         return {}
     groups = runs_in(run.paths[0])
@@ -88,7 +89,7 @@ def _one_run_a_group(run: RunFiles) -> dict[str, RunFiles]:
 
 
 def _one_run_a_file(run: RunFiles) -> dict[str, RunFiles]:
-    """Return a run for each file where all files have the same columns; nothing otherwise."""
+    """Return a run for each file if all files have the same columns; otherwise an empty dict."""
     tables = [path for path in run.paths if path.suffix.lower() in TABLES and path.is_file()]
     stems = [path.stem for path in tables]
     if len(tables) < 2 or len(tables) < len(run.paths) or len(set(stems)) < len(stems):
@@ -97,7 +98,7 @@ def _one_run_a_file(run: RunFiles) -> dict[str, RunFiles]:
     for path in tables:
         try:
             columns.append(tuple(read_log(path).names()))
-        except InputError:  # said when the run is read
+        except InputError:  # Reported when the run is read.
             return {}
     if len(set(columns)) > 1:
         return {}

@@ -1,17 +1,17 @@
-"""Heights in metres from a tracked ball.
+"""Convert the track of a ball to heights in metres.
 
-With the camera known they follow exactly. Without it: along the straight line of a vertical fall
-the inverse depth, and so the ball's radius r in pixels, is linear in the place s on the picture,
-and height is a projective function of s. Both together leave one unknown factor S:
+If the camera is known, heights follow exactly. Otherwise: along the straight line of a vertical
+fall the inverse depth, and so the ball's radius r in pixels, is linear in the position s in the
+image, and height is a projective function of s. Together they leave one unknown factor S:
 
     z = radius + S (s_ground - s) / r(s)                (1)
 
-For a camera that looks level S is the ball's radius in metres. A camera that looks down sees
-heights shortened and not the ball, so S is larger; then the fall itself tells it, since the second
+For a level camera, S is the ball's radius in metres. A camera that looks down sees heights
+shortened, but not the ball, so S is larger; then S follows from the fall itself, since the second
 derivative of z must be -g.
 
-With q = s / r(s), and since r is linear in s, (1) is the following but for a constant factor, which
-the unknown S takes up; g is gravity:
+With q = s / r(s), and since r is linear in s, (1) becomes, except for a constant factor that the
+unknown S absorbs (g is gravity):
 
     z = radius + S (q_ground - q)                       (2)
     q'' = g / S in flight                               (3)
@@ -30,25 +30,30 @@ from sims.camera.files import Filmed
 from sims.camera.track import Track
 
 GRAVITY = 9.81
-"""m/s^2, where a film does not know better."""
+"""Gravity assumed for a film, m/s^2."""
 _ARC = 7
-"""Frames that a flight has at least: fewer do not tell a parabola."""
+"""Minimum number of frames of a flight; fewer do not determine a parabola."""
 _RISE = 0.3
-"""What a flight extends over at least, in radii, or in metres where it is of heights."""
+"""Minimum extent of a flight, in ball radii, or in metres for heights."""
 _HELD = 0.25
-"""Seconds for which a ball is held at least before it is said to be."""
+"""Minimum duration in seconds for which a ball is held before its release."""
 _DIFFER = 0.05
-"""Share by which the fall's scale and the diameter's differ that is said."""
+"""Relative difference between the scales from the fall and the diameter that is reported."""
 _MEETING = 0.1
-"""Seconds around the end of a flight and the beginning of the next within which they meet."""
+"""Time in seconds around the end of a flight and the start of the next in which they may meet."""
 _FITS = 3
-"""Of the radius: the first weighs all frames alike, the others by what the one before left."""
+"""Number of reweighted line fits to the radius after the first, unweighted fit."""
 
 
 @dataclass(frozen=True)
 class Heights:
-    """Heights z (n,) of the ball's centre in metres, its radius in metres, how they were found, and
-    what to know.
+    """Heights of a ball's centre over time.
+
+    Attributes:
+        z: (n,) heights in metres.
+        radius: Radius of the ball in metres.
+        how: Method by which heights were found.
+        notes: Notes for the user.
     """
 
     z: Array
@@ -58,8 +63,13 @@ class Heights:
 
 
 class _Arc(NamedTuple):
-    """A flight between bounces: its coefficients (curvature first), from when to when, and how
-    firmly it tells.
+    """A flight between bounces.
+
+    Attributes:
+        curve: Coefficients of its parabola, highest power first.
+        begin: Time of its first frame, s.
+        end: Time of its last frame, s.
+        weight: Inverse variance of its curvature, up to a constant factor.
     """
 
     curve: Array
@@ -69,27 +79,35 @@ class _Arc(NamedTuple):
 
 
 def by_camera(track: Track, filmed: Filmed) -> Heights:
-    """Heights through the camera that made the film.
+    """Compute heights with the known camera of the film.
+
+    Args:
+        track: Track of the ball in the image.
+        filmed: Camera, radius and horizontal position of the ball.
 
     Raises:
-        InputError: the camera's picture has another shape than the film's.
+        InputError: The camera's image has another aspect ratio than the film.
     """
     camera = filmed.camera
     if camera.size[0] * track.size[1] != camera.size[1] * track.size[0]:
         sizes = f"the camera's picture has {camera.size} px, the film {track.size}"
         raise InputError(f"{sizes}; expected the same shape")
-    # A film may have been scaled: the camera is scaled with it.
+    # The film may have been resized, so the camera is resized with it.
     camera = camera.resized(*track.size)
     z = camera.heights(np.stack([track.u, track.v], axis=1), filmed.x, filmed.y, filmed.radius)
     return Heights(z, filmed.radius, "through the known camera")
 
 
 def by_scale(track: Track, diameter: float | None, scale: str | None) -> Heights:
-    """Heights from the ball's diameter [m], or from the fall where `scale` is "fall" or no diameter
-    is given.
+    """Compute heights without a camera, scaled by the ball's diameter or by the fall.
+
+    Args:
+        track: Track of the ball in the image.
+        diameter: Diameter of the ball in metres; None to scale by the fall.
+        scale: "fall" to scale by the fall although a diameter is given.
 
     Raises:
-        InputError: the film does not show what that needs.
+        InputError: The film does not show what the method needs.
     """
     q = _place(track) / _radius(track)
     arcs = _arcs(track.times, q)
@@ -104,7 +122,7 @@ def by_scale(track: Track, diameter: float | None, scale: str | None) -> Heights
             )
         factor = fallen
         how = f"scaled by the fall (gravity {GRAVITY:g} m/s^2; a drag would be taken for scale)"
-        # Without a diameter the ball is as large as a level camera would have it.
+        # Without a diameter, assume the radius that a level camera would give.
         ball = diameter / 2 if diameter else factor
     else:
         factor = ball = diameter / 2
@@ -114,17 +132,18 @@ def by_scale(track: Track, diameter: float | None, scale: str | None) -> Heights
                 f"the fall says {fallen / factor - 1:+.0%} for all heights: the camera looks down "
                 "or up, or gravity is not 9.81 m/s^2; the scale 'fall' uses the fall"
             )
-    return Heights(ball + factor * (ground - q), ball, how, tuple(notes))  # (2)
+    return Heights(ball + factor * (ground - q), ball, how, tuple(notes))  # Equation (2).
 
 
 def _place(track: Track) -> Array:
-    """Place along the line of the fall, down positive, px, such that the line's own perspective is
-    in `_radius`.
+    """Return the position along the line of the fall, downwards positive, in pixels.
+
+    The perspective along that line is described by `_radius`.
     """
     seen = track.seen
     points = np.stack([track.u[seen], track.v[seen]], axis=1)
     middle = points.mean(axis=0)
-    # The line of the fall is the direction in which the points spread most; v counts downwards.
+    # The line of the fall is the first principal axis of the points; v counts downwards.
     _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
     axis = axes[0] * (1.0 if axes[0][1] >= 0 else -1.0)
     if abs(axis[1]) < 0.5:
@@ -136,24 +155,22 @@ def _place(track: Track) -> Array:
 
 
 def _radius(track: Track) -> Array:
-    """The radius as a linear function of the place: what one frame says is too noisy."""
+    """Return the radius as a linear function of the position; single frames are too noisy."""
     s, seen = _place(track), track.seen
     places, radii = s[seen], track.radius[seen]
     line = np.polyfit(places, radii, 1)
     for _ in range(_FITS):
         rest = np.abs(radii - np.polyval(line, places))
-        # A frame whose outline is far off, as at an impact, hardly counts.
+        # A frame whose outline is far off, as at an impact, gets a small weight.
         typical = max(float(np.median(rest)), 1e-9)
         line = np.polyfit(places, radii, 1, w=1 / (1 + (rest / typical) ** 2))
-    # The line may cross zero beyond the frames that show the ball; a radius may not.
+    # The line may cross zero outside the frames that show the ball; a radius may not.
     result: Array = np.maximum(np.polyval(line, s), 0.3 * float(np.median(radii)))
     return result
 
 
 def _arcs(times: Array, q: Array) -> list[_Arc]:
-    """Flights: stretches between places where the ball turns from down to up, each with its
-    parabola.
-    """
+    """Find flights between the lowest points of the ball, and fit a parabola to each."""
     seen = np.flatnonzero(np.isfinite(q))
     last = len(seen) - 1
     # q counts downwards: the ball is lowest where q is largest.
@@ -167,7 +184,7 @@ def _arcs(times: Array, q: Array) -> list[_Arc]:
         t = times[inside]
         curve, rest, *_ = np.polyfit(t, q[inside], 2, full=True)
         scatter = float(np.sqrt(rest[0] / len(t))) if len(rest) else 0.0
-        # What is no parabola is no flight: a hand, a roll, another ball.
+        # A motion that is not a parabola is not a flight, but a hand, a roll or another ball.
         if scatter < 0.05 * np.ptp(q[inside]) + 0.02:
             # The variance of a parabola's curvature goes as 1 / (n T^4), for n samples in T.
             arcs.append(_Arc(curve, t[0], t[-1], len(t) * float(t[-1] - t[0]) ** 4))
@@ -175,36 +192,42 @@ def _arcs(times: Array, q: Array) -> list[_Arc]:
 
 
 def _factor(arcs: list[_Arc]) -> float | None:
-    """S for which the flights fall with gravity: its `q` has the second derivative g / S."""
+    """Return the S for which the flights fall with gravity; None without a falling flight."""
     falling = [arc for arc in arcs if arc.curve[0] > 0]
     if not falling:
         return None
     curvatures = [2 * arc.curve[0] for arc in falling]
     mean = np.average(curvatures, weights=[arc.weight for arc in falling])
-    return float(GRAVITY / mean)  # (3)
+    return float(GRAVITY / mean)  # Equation (3).
 
 
 def _ground(track: Track, q: Array, arcs: list[_Arc]) -> float:
-    """`q` where the ball touches the ground: where flights meet, or where it lies."""
+    """Return q at ground contact: where flights meet, or the lowest position."""
     meets = []
     for before, after in pairwise(arcs):
         roots = np.roots(before.curve - after.curve)
-        # Two parabolas meet twice at most: at the bounce, and where neither flight is.
+        # Two parabolas have up to two intersections: the bounce, and one outside both flights.
         begin, end = before.end - _MEETING, after.begin + _MEETING
         real = [r.real for r in roots if abs(r.imag) < 1e-9 and begin < r.real < end]
         meets += [float(np.polyval(before.curve, r)) for r in real[:1]]
     if meets:
         return float(np.median(meets))
-    # Without two flights: the lowest place, but for frames in which the tracker erred.
+    # Without two flights, use the lowest position, but ignore frames with tracking errors.
     return float(np.nanpercentile(q, 99.5)) if len(track.seen) else 0.0
 
 
 def scatter(times: Array, z: Array) -> float:
-    """1 sigma of what a cubic leaves of each flight, m: also errors that last for several samples;
-    NaN without flight.
+    """Estimate the height noise from the residuals of a cubic fitted to each flight.
 
-    A cubic has room for gravity and a drag. White noise estimated from neighbouring samples alone
-    would pass over the errors that a slowly changing outline makes.
+    A cubic can represent gravity and a drag. White noise estimated from neighbouring samples alone
+    would miss the errors of a slowly changing outline, which last for several samples.
+
+    Args:
+        times: (n,) times, s.
+        z: (n,) heights, m.
+
+    Returns:
+        Standard deviation (1 sigma) in m; NaN without a flight.
     """
     squares, freedom = 0.0, 0
     for arc in _arcs(times, -z):
@@ -219,10 +242,10 @@ def scatter(times: Array, z: Array) -> float:
 
 
 def released(track: Track) -> int:
-    """The frame at which the ball begins to move; 0 unless it is held for a while before."""
+    """Find the frame at which the ball begins to move; the first one unless it is held before."""
     s, seen = _place(track), track.seen
     start = float(np.median(s[seen[:5]]))
-    # A hand trembles, and an outline errs: a pixel, or four sigmas, is no fall yet.
+    # Up to a pixel, or four sigmas, is a trembling hand or an error of the outline, not a fall.
     moved = np.flatnonzero(np.abs(s[seen] - start) > max(1.0, 4 * track.noise))
     first = int(seen[0])
     if not len(moved):

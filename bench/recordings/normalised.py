@@ -1,5 +1,7 @@
-"""Normalised positions of LeRobot, -100 to 100 of a joint's range (0 to 100 of a gripper's), which
-look like degrees: no number of a dataset tells the two apart, only a calibration file or its user.
+"""Normalised positions of LeRobot: -100 to 100 of a joint's range (0 to 100 for a gripper).
+
+They look like degrees: only a calibration file or the user can distinguish them, not the numbers of
+a dataset.
 """
 
 from __future__ import annotations
@@ -25,25 +27,25 @@ from sims.recording.lerobot_calibration import (
 from sims.recording.recording import Recording
 from sims.user_toml import read_toml
 
-if TYPE_CHECKING:  # a recording of no robot needs no model
+if TYPE_CHECKING:  # A recording without a robot needs no model.
     from sims.robot.model import Joint
 
 LARGEST = 100.0 + 1e-3
-"""Largest magnitude of a normalised position, with the rounding of 32 bits."""
+"""Largest magnitude of a normalised position, including the rounding of 32-bit floats."""
 REMEDY = (
     "if they are normalised, import them with --calibration FILE (LeRobot keeps it in "
     "~/.cache/huggingface/lerobot/calibration) or with --position-unit normalised (by the model's "
     "ranges); if they are degrees, with --position-unit deg"
 )
-"""What to do about positions that may be normalised."""
+"""Advice for positions that may be normalised."""
 
 
 class NormalisedPositions:
-    """How the normalised positions of a log become angles.
+    """Conversion of the normalised positions of a log to angles.
 
     Args:
-        motors: calibrated ranges by motor; empty where only the model's ranges are known.
-        source: the calibration file; None where there is none.
+        motors: Calibrated ranges by motor; empty if only the model's ranges are known.
+        source: The calibration file; None if there is none.
     """
 
     def __init__(self, motors: Mapping[str, MotorRange], source: Path | None) -> None:
@@ -51,17 +53,20 @@ class NormalisedPositions:
         self.source = source
 
     def scale_of(self, column: str, values: Array, joint: Joint) -> tuple[str, AngleScale] | None:
-        """Return the unit of a column's positions, and how they become it; None where neither a
-        calibration nor the model says the range of the joint.
+        """Return the unit of a column's positions, and their conversion to it.
 
         Args:
-            column: its name.
-            values: (T,) its numbers.
-            joint: that it is of.
+            column: Name of the column.
+            values: (T,) numbers of the column.
+            joint: Joint of the column.
+
+        Returns:
+            Unit and conversion; None if neither a calibration nor the model gives the joint's
+                range.
         """
         from_zero = "gripper" in column.lower() and float(np.nanmin(values)) >= 0.0
         motor = motor_of(column, self.motors)
-        # Counts of a slide's motor are no metres: its range is the model's.
+        # Encoder counts of a slide joint's motor are not metres, so the model's range is used.
         if motor is not None and joint.kind == "hinge":
             return "deg", angle_scale(self.motors[motor], from_zero)
         if joint.range is None:
@@ -70,7 +75,7 @@ class NormalisedPositions:
 
     @property
     def description(self) -> str:
-        """The ranges to which the positions are normalised."""
+        """The ranges to which the positions are normalised, as text."""
         ranges = "the joints' ranges in the model"
         if self.source is not None:
             ranges = f"the ranges in {self.source.name}, zero in the middle of each"
@@ -80,16 +85,16 @@ class NormalisedPositions:
 def normalised_positions(
     log: Path, largest: float, stated: str, calibration: Path | None
 ) -> NormalisedPositions | None:
-    """Return how positions become angles; None where they are to be taken for angles.
+    """Return the conversion of positions to angles; None if they are angles already.
 
     Args:
-        log: that holds them.
-        largest: magnitude among them.
-        stated: unit that the user states; empty where none is stated.
-        calibration: file that the user names; None to look for one in the dataset and beside it.
+        log: Log that contains the positions.
+        largest: Largest magnitude of the positions.
+        stated: Unit that the user states; empty if none is stated.
+        calibration: File that the user names; None to search one in and next to the dataset.
 
     Raises:
-        InputError: they are said to be normalised and are not, or the file cannot be read.
+        InputError: Positions stated as normalised are out of range, or the file cannot be read.
     """
     within = largest <= LARGEST
     asked = stated == "normalised" or calibration is not None
@@ -110,14 +115,21 @@ def normalised_positions(
 
 
 def is_lerobot(log: Path, columns: Iterable[str]) -> bool:
-    """Return whether a log is one of LeRobot: an episode, or a table with its names."""
+    """Return whether a log is from LeRobot: an episode, or a table with its column names.
+
+    Args:
+        log: Path of the log.
+        columns: Names of its columns.
+    """
     names = ("observation.state", "observation/state")
     return episode_of(log) is not None or any(column.startswith(names) for column in columns)
 
 
 def may_be_normalised(recording: Recording) -> Iterator[Oddity]:
-    """Yield the oddity of a LeRobot dataset whose positions are taken for degrees and lie within
-    -100 to 100; a channel that states its `scale` is not doubted.
+    """Yield an anomaly if positions of a LeRobot dataset in degrees may be normalised.
+
+    That is so if all of them lie within -100 to 100; channels whose description states a `scale`
+    are not checked.
     """
     description = recording.path.with_suffix(".toml")
     if not description.is_file():
@@ -147,7 +159,7 @@ def may_be_normalised(recording: Recording) -> Iterator[Oddity]:
 
 
 def _episodes(description: Path, meta: Mapping[str, object]) -> bool:
-    """Whether a description's runs are episodes of a dataset."""
+    """Return whether a description's runs are episodes of a dataset."""
     runs = meta.get("runs")
     tables = runs.values() if isinstance(runs, dict) else ()
     folders = [own.get("folder") for own in tables if isinstance(own, dict)]
@@ -158,5 +170,5 @@ def _episodes(description: Path, meta: Mapping[str, object]) -> bool:
 
 
 def _folders(dataset: Path) -> Sequence[Path]:
-    """Where the calibration of a dataset may lie."""
+    """Return the folders that may contain the calibration of a dataset."""
     return [dataset, dataset / "meta", dataset / "calibration", dataset.parent]

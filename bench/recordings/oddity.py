@@ -1,4 +1,4 @@
-"""What is odd about a recording, before anything is fitted to it."""
+"""Anomaly of a recording, found before any model is fitted."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 
 class Oddity(NamedTuple):
-    """Something odd.
+    """An implausible property of a recording.
 
     Attributes:
-        text: one line, without the file's name.
-        certain: whether nothing sound could look like this.
+        text: One line, without the file's name.
+        certain: Whether no correct recording can have this property.
     """
 
     text: str

@@ -1,13 +1,12 @@
-"""Which order of joints the model prefers, where a log names none: that in which the forces of the
-drives explain the motion best.
+"""Find the order of joints that a model prefers if a log names no joints.
 
 With the measured positions smoothed by a Savitzky-Golay filter, inverse dynamics give the force
-f_j(t) that each joint needs, and the model's actuators give the force a_j(t) that they exert with
-the recorded commands. An order of the columns is worth
+f_j(t) that each joint needs, and the model's actuators give the force a_j(t) that they exert under
+the recorded commands. An order of the columns is rated by
 
     R = sqrt(sum_j mean((f_j - a_j)^2) / sum_j mean(a_j^2))                                      (1)
 
-which is small where the order is right, and of the size of 1 where it is not.
+which is small if the order is right, and about 1 otherwise.
 """
 
 from __future__ import annotations
@@ -25,26 +24,26 @@ from sims.robot.model import Actuator, Joint, Robot
 from sims.robot.quiet import quiet
 
 ALL_ORDERS = 4
-"""Maximum number of joints of which every order is tried."""
+"""Maximum number of joints for which every order is tested."""
 WINDOW = 11
-"""Samples of the smoothing window."""
+"""Length of the smoothing window in samples."""
 DEGREE = 3
 """Degree of the smoothing polynomial."""
 INSTANTS = 150
-"""Maximum number of instants at which forces are compared."""
+"""Maximum number of times at which forces are compared."""
 PREFERRED = 0.5
-"""Maximum of (1) for the preferred order over (1) for the model's order."""
+"""Maximum ratio of R in (1) for the preferred order to R for the model's order."""
 EXPLAINED = 0.7
-"""Maximum of (1) for the preferred order: a model that explains little prefers nothing."""
+"""Maximum R in (1) for the preferred order; a model that explains little prefers no order."""
 
 
 class PreferredOrder(NamedTuple):
     """The order that a model prefers.
 
     Attributes:
-        order: for each joint the place of its column.
-        residual: (1) for this order.
-        usual: (1) for the model's own order.
+        order: For each joint the index of its column.
+        residual: R of equation (1) for this order.
+        usual: R of equation (1) for the model's own order.
     """
 
     order: tuple[int, ...]
@@ -66,14 +65,14 @@ def preferred_order(
     """Find the order of columns with which a model explains a motion best.
 
     Args:
-        robot: the model.
-        driven: joints with their actuators, in the model's order.
+        robot: The model.
+        driven: Joints with their actuators, in the model's order.
         times: (T,) seconds.
-        commands: (T,) of each actuator, SI units.
-        positions: (T,) of each joint, SI units.
+        commands: (T,) command of each actuator, SI units.
+        positions: (T,) position of each joint, SI units.
 
     Returns:
-        The order; None where the motion is too short, or the model explains little of it.
+        The best order; None if the motion is too short or there are fewer than two joints.
     """
     known = np.isfinite(commands).all(axis=0) & np.isfinite(positions).all(axis=0)
     known &= np.diff(times, prepend=-np.inf) > 0
@@ -97,14 +96,14 @@ def preferred_order(
 
 
 def _orders(names: Sequence[str]) -> Iterator[tuple[int, ...]]:
-    """The orders that are tried: all of few joints, else the usual ones with two exchanged."""
+    """Yield the tested orders: all for few joints, else common ones and exchanges of two."""
     count = len(names)
     if count <= ALL_ORDERS:
         yield from permutations(range(count))
         return
     by_name = sorted(range(count), key=lambda place: names[place])
     as_stated = list(range(count))
-    # The column of joint j stands where its name does in the sorted list.
+    # The column of joint j is at the index of its name in the sorted list.
     alphabetical = [by_name.index(j) for j in range(count)]
     for order in (as_stated, alphabetical, as_stated[::-1]):
         yield tuple(order)
@@ -117,13 +116,13 @@ def _orders(names: Sequence[str]) -> Iterator[tuple[int, ...]]:
 def _residual(
     robot: Robot, driven: Sequence[tuple[Joint, Actuator]], commands: Array, motion: Array
 ) -> float:
-    """(1) of an order; infinite where it takes joints far beyond their ranges.
+    """Compute R of (1) for an order; infinite if joints would be far beyond their ranges.
 
     Args:
-        robot: the model.
-        driven: joints with their actuators.
-        commands: (J, T) of them.
-        motion: (3, J, T) positions, velocities and accelerations of them.
+        robot: The model.
+        driven: Joints with their actuators.
+        commands: (J, T) their commands.
+        motion: (3, J, T) their positions, velocities and accelerations.
     """
     import mujoco
 

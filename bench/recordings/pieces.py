@@ -1,14 +1,16 @@
-"""Recordings of robots in pieces: long ones, since what is searched costs steps of the simulator,
-and pieces from all over a recording tell nearly as much as the whole of it; and those of motion
-that drifts or is unstable, which no simulation follows for long, if the user asks for it.
+"""Cut long recordings of robots into segments with their own initial states.
+
+Long recordings are cut because a search costs simulator steps, and segments from all over a
+recording are nearly as informative as the whole. Recordings of drifting or unstable motion, which
+no simulation follows for long, are cut if the user requests it.
 
 A search costs about
 
     steps x evaluations of a step x (joints + 3)                                                (1)
 
-by what was measured with one joint and with six. Pieces lie evenly over each run and begin where
-its commands have been quiet, so that hardly anything of what was commanded before is left in the
-motion; what drives may still feel of it goes with them.
+as measured with one joint and with six. Segments are spread evenly over each run and begin where
+its commands have been quiet, so that the effect of earlier commands has nearly decayed; the earlier
+samples that drives may still depend on are kept with each segment.
 """
 
 from __future__ import annotations
@@ -22,23 +24,23 @@ from sims.base import Array, InputError, Simulator
 from sims.recording.recording import Recording, Run
 
 MOST = 1.6e5
-"""(1) from which on a recording is cut: 35 s of six joints at a step of 2 ms."""
+"""Cost (1) above which a recording is cut: 35 s of six joints at a step of 2 ms."""
 PIECE = 2.0
-"""Seconds of a piece, if runs are no shorter."""
+"""Duration of a segment in seconds, unless runs are shorter."""
 FEWEST = 20
-"""Intervals of a piece, at least."""
+"""Minimum number of sampling intervals of a segment."""
 EVEN = 1e-9
-"""Seconds by which rounding may move an end."""
+"""Tolerance in seconds for rounding errors at the end of a segment."""
 QUIET = 0.2
-"""Seconds before a piece in which its commands change little."""
+"""Duration in seconds before a segment in which its commands should change little."""
 
 
 EVALUATIONS = {"RK4": 2.0}
-"""What a step costs by integrator, one otherwise: of four evaluations half is saved elsewhere."""
+"""Cost of a step by integrator, 1 otherwise: half of RK4's four evaluations is saved elsewhere."""
 
 
 class Cut(NamedTuple):
-    """A recording in pieces, and what is to be said of it; nothing where it is whole."""
+    """A segmented recording and a message about it, which is empty if the recording is whole."""
 
     recording: Recording
     note: str
@@ -50,17 +52,23 @@ def cut(
     seconds: float | None = None,
     whole: bool = False,
 ) -> Cut:
-    """The recording with its runs in pieces where it is too long to be searched whole, or where
-    pieces are asked for.
+    """Cut the runs of a recording into segments if it is too long or if the user requests it.
 
-    Runs for fitting are left in pieces that cost `MOST` together, held-out ones likewise; each is
-    there in one piece at least.
+    Runs for fitting are reduced to segments that together cost `MOST`, and so are held-out runs; at
+    least one segment of each run is kept.
 
     Args:
-        recording: as it was read.
-        kind: a simulator of its system; one without a model file is cut only if it is asked for.
-        seconds: of a piece, if every run is to be cut into such; `PIECE` where it is too long.
-        whole: keep all pieces, and a recording whole that none are asked for of.
+        recording: Recording as it was read.
+        kind: Simulator class of its system; without a model file it is cut only on request.
+        seconds: Duration of a segment if every run is to be cut; None to cut long recordings only,
+            into segments of `PIECE` seconds.
+        whole: Whether to keep all segments, and to leave the recording whole if `seconds` is None.
+
+    Returns:
+        The recording, with a message for the user.
+
+    Raises:
+        InputError: Segments are requested for a robot with floating bodies.
     """
     if seconds is None and (whole or not kind.has_model):
         return Cut(recording, "")
@@ -95,7 +103,7 @@ def cut(
 
 
 def _budget(kind: type[Simulator]) -> float:
-    """Seconds of a robot's motion that cost `MOST`."""
+    """Return the seconds of a robot's motion that cost `MOST`."""
     robot: Any = kind
     step, integrator = robot.numerics
     joints = sum(joint.single for joint in robot.robot.joints)
@@ -107,9 +115,9 @@ def _seconds(run: Run) -> float:
 
 
 def _pieces(run: Run, seconds: float, longest: float) -> list[Run]:
-    """Pieces of a run that last so long together, none longer than that."""
+    """Cut a run into segments of at most `longest` seconds that last `seconds` in total."""
     length = min(longest, seconds)
-    # A piece must hold a few samples, however little may be kept of a run.
+    # A segment needs a few samples, even if only little of a run may be kept.
     length = max(length, FEWEST * float(np.median(np.diff(run.times))))
     count = max(int(seconds / length + 0.5), 1)
     span = _seconds(run) / count
@@ -117,12 +125,12 @@ def _pieces(run: Run, seconds: float, longest: float) -> list[Run]:
     change = _changes(run)
     pieces = []
     for number in range(count):
-        # A piece may begin anywhere in its part of the run, where that leaves room for it.
+        # A segment may begin anywhere in its part of the run that leaves enough room for it.
         first = run.times[0] + number * span
         low, high = np.searchsorted(run.times, (first, first + max(span - length, 0.0)))
         high = max(high, low + 1)
         begin = int(low + np.argmin(change[low:high]))
-        # The sample at its very end is the next one's first.
+        # The sample at its very end is the first sample of the next segment.
         end = int(np.searchsorted(run.times, run.times[begin] + length - EVEN))
         name = f"{run.name} from {run.times[begin]:.4g} s"
         pieces.append(run.part(slice(begin, end), name))
@@ -130,13 +138,13 @@ def _pieces(run: Run, seconds: float, longest: float) -> list[Run]:
 
 
 def _first(run: Run, seconds: float, _: float) -> list[Run]:
-    """The beginning of a run, which is known where bodies float."""
+    """Return the beginning of a run, the only part with a known pose of floating bodies."""
     end = int(np.searchsorted(run.times, run.times[0] + seconds - EVEN))
     return [run.part(slice(0, max(end, FEWEST)), f"{run.name}, its first {seconds:.4g} s")]
 
 
 def _changes(run: Run) -> Array:
-    """(T,) how much the commands changed just before each sample, each in shares of its spread."""
+    """Return (T,) the change of the commands before each sample, relative to their range."""
     back = np.searchsorted(run.times, run.times - QUIET)
     total = np.zeros(run.times.size)
     for values in run.inputs.values():

@@ -1,12 +1,12 @@
-"""Whether the positions of a robot's log can be what they are said to be: its joints' limits and
-the commands of its servos tell of degrees, of signs that are turned and of columns swapped.
+"""Check the plausibility of a robot's positions in a log.
 
-A servo's joint follows its command more or less: over the samples of all runs, with the command u
-and the position q about their means,
+Joint limits and servo commands reveal wrong units (degrees), reversed signs and exchanged columns.
+The joint of a servo approximately follows its command: over the samples of all runs, with the
+command u and the position q about their means,
 
     b = <u q> / <u^2>,    r = <u q> / sqrt(<u^2> <q^2>)                       (1)
 
-say how far it goes with it, and how alike the two are.
+are the slope and the correlation.
 """
 
 from __future__ import annotations
@@ -22,27 +22,35 @@ from sims.recording.recording import Recording, Run
 from sims.robot.quiet import quiet
 
 BEYOND = 1.0
-"""Times the width of its range, a joint is not beyond its end, whatever its limits are worth."""
+"""Maximum plausible distance of a position beyond its joint's range, as a fraction of the range."""
 OVER = 0.02
-"""Of the width of its range, a joint may seem to be beyond its end by noise, or by an offset."""
+"""Distance beyond a joint's range explained by noise or an offset, as a fraction of the range."""
 TURNS = 8.0
-"""Turns of a joint without limits of which nobody wonders."""
+"""Maximum plausible number of turns of a joint without limits."""
 ALIKE = 0.9
-"""Of (1): a position that follows a command is at least so much like it."""
+"""Minimum correlation r of (1) for a position that follows a command."""
 UNLIKE = 0.7
-"""And one that has nothing to do with it less than this."""
+"""Maximum absolute correlation r of (1) for a position that does not follow a command."""
 AGAINST = -0.3
-"""A servo that follows its command backwards has at most this slope."""
+"""Maximum slope b of (1) for a servo that follows its command with reversed sign."""
 OTHER = (40.0, 80.0)
-"""Slopes between which one of the two is in degrees: 57.3."""
+"""Range of slopes b of (1) which show that one of the two signals is in degrees (57.3)."""
 ROWS = 100
-"""Instants of a run at which its forces are looked at."""
+"""Maximum number of times of a run at which forces or contacts are evaluated."""
 _SMALLER = {"rad": (np.pi / 180.0, "degrees"), "m": (1e-3, "millimetres")}
-"""What one of the smaller units is that people record in."""
+"""Smaller unit in which positions are often recorded, by SI unit: its value and name."""
 
 
 def odd_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Oddity]:
-    """What is odd about a robot's positions; nothing of what is no robot."""
+    """Find implausible positions of a robot; none for other systems.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        Anomalies of joint ranges and of servos.
+    """
     if not kind.has_model:
         return
     robot: Any = kind
@@ -53,7 +61,7 @@ def odd_poses(recording: Recording, kind: type[Simulator]) -> Iterator[Oddity]:
 
 
 def _beyond(recording: Recording, joint: Any) -> Iterator[Oddity]:
-    """Positions beyond a joint's limits by far; the first run that has them stands for all."""
+    """Find positions far beyond a joint's limits; only the first such run is reported."""
     column = f"q.{joint.name}"
     unit, (smaller, name) = joint.unit, _SMALLER[joint.unit]
     for run in recording.runs:
@@ -89,8 +97,14 @@ def _beyond(recording: Recording, joint: Any) -> Iterator[Oddity]:
 
 
 def accelerations(run: Run, kind: type[Simulator]) -> Array:
-    """(N, D) accelerations of a robot at rest in recorded positions with the recorded commands, at
-    some `ROWS` instants of the run.
+    """Compute accelerations of a robot at rest in recorded positions under recorded commands.
+
+    Args:
+        run: Run with the positions and commands.
+        kind: Simulator class of the robot.
+
+    Returns:
+        (N, D) accelerations at up to `ROWS` times of the run.
     """
     import mujoco
 
@@ -115,11 +129,12 @@ def accelerations(run: Run, kind: type[Simulator]) -> Array:
 
 
 def contacts(kind: type[Simulator], positions: Mapping[str, Array]) -> frozenset[tuple[int, int]]:
-    """Pairs of a robot's geoms that touch at some of `ROWS` instants of a motion.
+    """Find pairs of a robot's geoms that touch at some of `ROWS` times of a motion.
 
     Args:
-        kind: simulates the robot.
-        positions: (N,) of each joint, rad or m, by channel; joints without stay where they begin.
+        kind: Simulator class of the robot.
+        positions: (N,) position of each joint, rad or m, by channel; other joints keep their
+            initial position.
     """
     import mujoco
 
@@ -145,14 +160,14 @@ def _at(run: Run, name: str, row: int) -> float:
 
 
 class _Pair(NamedTuple):
-    """How a position follows a command, (1)."""
+    """Slope and correlation of a position against a command, equation (1)."""
 
     slope: float
     like: float
 
 
 def _servos(recording: Recording, robot: Any) -> Iterator[Oddity]:
-    """Servos whose joints do what no servo does."""
+    """Find servos whose joints do not behave like a servo."""
     driven = [
         (f"u.{a.name}", f"q.{a.joint}")
         for a in robot.actuators
@@ -182,7 +197,7 @@ def _servos(recording: Recording, robot: Any) -> Iterator[Oddity]:
 def _swapped(
     driven: list[tuple[str, str]], pairs: dict[tuple[str, str], _Pair]
 ) -> Iterator[Oddity]:
-    """Two joints that follow each other's commands and not their own."""
+    """Find two joints that follow each other's commands and not their own."""
     for i, (command, position) in enumerate(driven):
         for other_command, other in driven[i + 1 :]:
             crossed = pairs[command, other].like, pairs[other_command, position].like
@@ -193,13 +208,13 @@ def _swapped(
 
 
 def _both(recording: Recording, actuator: Any) -> bool:
-    """Whether its command and its joint's position are recorded."""
+    """Return whether an actuator's command and its joint's position are recorded."""
     first = recording.runs[0]
     return f"u.{actuator.name}" in first.inputs and f"q.{actuator.joint}" in first.channels
 
 
 def _pair(recording: Recording, command: str, position: str) -> _Pair:
-    """(1) over all runs, each about its own means."""
+    """Compute (1) over all runs, each run about its own means."""
     squares = np.zeros(3)
     for run in recording.runs:
         u, q = run.inputs[command], run.channels[position]
@@ -208,7 +223,7 @@ def _pair(recording: Recording, command: str, position: str) -> _Pair:
             squares += _products(u[seen], q[seen])
     uu, uq, qq = squares
     if min(uu, qq) <= 0 or uq == 0:
-        return _Pair(1.0, 0.0)  # one of the two stands still: nothing is said
+        return _Pair(1.0, 0.0)  # One of the two is constant, so nothing can be concluded.
     return _Pair(float(uq / uu), float(uq / np.sqrt(uu * qq)))
 
 

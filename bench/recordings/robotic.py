@@ -1,6 +1,4 @@
-"""What there is to say of a robot's recording beside its signals: what was read of the model file,
-what the log leaves out, and where it goes beyond the limits that the file states.
-"""
+"""Describe a robot's model file, signals missing in its log, and positions beyond limits."""
 
 from __future__ import annotations
 
@@ -15,14 +13,15 @@ from sims.robot.model import Robot
 from sims.robot.simulator import RobotSimulator
 
 SLACK = 0.01
-"""Of a range, by which a log may go beyond it: limits give way, encoders are offset."""
+"""Tolerance beyond a limit, as a fraction of the range, for soft limits and encoder offsets."""
 MOST = 4
-"""Runs that are named in one line."""
+"""Maximum number of runs that are named in one line."""
 
 
 def about(kind: type[Simulator]) -> Iterator[str]:
-    """Lines on the robot of a simulator: its file, its places, what was mended; none for another
-    simulator.
+    """Yield lines about the robot of a simulator: its file, its parts and notes on repairs.
+
+    Other simulators have no lines.
     """
     if not kind.has_model:
         return
@@ -46,7 +45,12 @@ def _plural(word: str, count: int) -> str:
 
 
 def odd(recording: Recording, kind: type[Simulator]) -> Iterator[str]:
-    """Lines on what the log leaves out and where it goes beyond limits."""
+    """Yield lines about signals missing in the log and signals beyond their limits.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+    """
     if not kind.has_model:
         return
     robot = cast(type[RobotSimulator], kind).robot
@@ -67,7 +71,7 @@ def _left_out(recording: Recording, robot: Robot) -> Iterator[str]:
 
 
 def _beyond(recording: Recording, robot: Robot) -> Iterator[str]:
-    """A line for each signal that leaves its range."""
+    """Yield a line for each signal that leaves its range."""
     model = robot.path.name
     for joint in robot.joints:
         if joint.single:
@@ -81,7 +85,7 @@ def _beyond(recording: Recording, robot: Robot) -> Iterator[str]:
 def _outside(
     recording: Recording, name: str, limits: tuple[float, float] | None, unit: str, model: str
 ) -> Iterator[str]:
-    """Whether a signal leaves its range, in which runs, and how far."""
+    """Yield a line if a signal leaves its range, with the runs and the extreme values."""
     if limits is None:
         return
     low, high = limits

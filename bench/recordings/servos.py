@@ -1,12 +1,13 @@
-"""How a servo of unknown gains follows its command, as a first guess of them.
+"""Estimate natural frequency and damping of a servo from its command and position.
 
-A joint whose drive pulls it towards the command u by a spring and a damper moves as
+The result is a first guess of unknown gains. A joint whose drive pulls it towards the command u by
+a spring and a damper moves as
 
     q'' = w^2 (u - q) - 2 d w q'                                                                 (1)
 
-with w the natural frequency and d the share of critical damping. Commands are held over a sample,
-so (1) is exact from sample to sample (C. Van Loan, IEEE Trans. Autom. Control 23(3), 395, 1978); w
-and d are those of a grid that leave least of the position after an offset.
+with the natural frequency w and the damping ratio d. Commands are held over a sample, so (1) is
+integrated exactly from sample to sample (C. Van Loan, IEEE Trans. Autom. Control 23(3), 395, 1978);
+w and d are the grid values with the smallest residual of the position after removal of an offset.
 """
 
 from __future__ import annotations
@@ -20,35 +21,38 @@ import numpy as np
 from sims.base import Array
 
 FREQUENCIES = np.geomspace(2.0, 200.0, 33)
-"""rad/s."""
+"""Grid of natural frequencies in rad/s."""
 DAMPINGS = np.geomspace(0.3, 6.0, 14)
 LIKE = 0.8
-"""Share of a position's variance that (1) explains at least."""
+"""Minimum share of a position's variance that (1) must explain."""
 MOST = 4000
-"""Samples that are looked at."""
+"""Maximum number of samples per run that are used."""
 MOVES = 20
-"""Samples of a log, at least."""
+"""Minimum number of samples of a run."""
 
 
 class Following(NamedTuple):
-    """Natural frequency in rad/s, and share of critical damping."""
+    """Natural frequency in rad/s, and damping ratio."""
 
     frequency: float
     damping: float
 
 
 def following(runs: Sequence[tuple[Array, Array, Array]]) -> Following | None:
-    """How a position follows its command; None where it does not, or hardly moves.
+    """Estimate how a position follows its command.
 
     Args:
-        runs: (T,) times in s, about even, (T,) commands, each held to the next sample, and (T,)
-            positions in the same unit.
+        runs: For each run (T,) times in s, about uniform, (T,) commands, each held to the next
+            sample, and (T,) positions in the same unit.
+
+    Returns:
+        Frequency and damping; None if the position hardly moves or does not follow.
     """
     clean = [_seen(*run) for run in runs]
     moving = [(t, u, q) for t, u, q in clean if t.size >= MOVES and np.std(u) > 0 and np.std(q) > 0]
     if not moving:
         return None
-    # Loaded here alone: it is much.
+    # Import SciPy's signal module only here, since it is large.
     from scipy.signal import cont2discrete, lfilter
 
     step = float(np.median([np.median(np.diff(t)) for t, _, _ in moving]))
@@ -66,6 +70,6 @@ def following(runs: Sequence[tuple[Array, Array, Array]]) -> Following | None:
 
 
 def _seen(times: Array, command: Array, position: Array) -> tuple[Array, Array, Array]:
-    """The samples that there are, the first ones of a long run."""
+    """Return the samples that are not missing, at most the first `MOST`."""
     seen = np.isfinite(position) & np.isfinite(command)
     return times[seen][:MOST], command[seen][:MOST], position[seen][:MOST]

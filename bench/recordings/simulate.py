@@ -1,7 +1,7 @@
-"""Recordings made by simulation: data whose truth is known, to try things out on.
+"""Simulate recordings with known truth, for tests and trials.
 
-The recording tells what a real one would; the truth goes to a file of its own, so that a blind test
-stays blind.
+The recording contains only what a real one would; the true parameters go to a separate file, so
+that a blind test stays blind.
 """
 
 from __future__ import annotations
@@ -29,39 +29,39 @@ from sims.system import UsualRecording
 from sims.user_toml import known
 
 _DIGITS = 9
-"""Significant digits of a number in the table: finer than any sensor, and files stay small."""
+"""Number of significant digits in the table: finer than any sensor, but files stay small."""
 _MOST_SAMPLES = 1e8
-"""Samples of a run beyond which a length or a rate is a slip of the pen."""
+"""Number of samples per run above which a length or rate is considered a typing error."""
 EVERY = "*"
-"""The name that stands for every channel that is not named."""
+"""Name that stands for every channel that is not named."""
 
 Coefficients = float | Sequence[float] | Mapping[str, float]
-"""Of one effect: the first, several in order, or some by name."""
+"""Coefficients of one effect: the first one, several in order, or some by name."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """A recording to make; all numbers SI.
+    """Specification of a recording to simulate; all numbers in SI units.
 
     Attributes:
-        system: registered name; empty where there is a model.
-        model: a robot's model file, MJCF or URDF.
-        actuators: that the model file lacks, as in a recording's ``[actuators.NAME]``.
-        parameters: other than their nominal values, by name; or all of them in order.
-        effects: that act, with their coefficients.
-        constants: other than the defaults.
-        noise: 1 sigma of every channel, or by channel; ``*`` names those that are not named.
-        inputs: by name, a constant or the text of a signal (`bench.problem.signals`).
-        initial: initial states by name, a value or (low, high) from which each run draws.
-        observe: channels to record; the system's usual ones where empty.
-        runs: how many.
-        seconds: length of a run.
-        rate: samples a second.
-        engine: None for the batch engine where there is a choice.
-        seed: of all that is drawn.
-        held_out: how many of the last runs are marked; None for a third of them, at least one of
-            several.
-        force: whether to make it although it needs more than this machine has.
+        system: Registered name; empty if a model is given.
+        model: A robot's model file, MJCF or URDF.
+        actuators: Actuators that the model file lacks, as in a recording's ``[actuators.NAME]``.
+        parameters: Parameters that differ from their nominal values, by name; or all in order.
+        effects: Active effects with their coefficients.
+        constants: Constants that differ from their defaults.
+        noise: 1 sigma of every channel, or by channel; ``*`` stands for channels not named.
+        inputs: By name, a constant or the text of a signal (`bench.problem.signals`).
+        initial: Initial states by name, a value or (low, high) for a uniform draw in each run.
+        observe: Channels to record; empty for the system's default channels.
+        runs: Number of runs.
+        seconds: Length of a run in seconds.
+        rate: Samples per second.
+        engine: Engine to use; None for the batch engine if there is a choice.
+        seed: Seed of all random numbers.
+        held_out: Number of final runs that are marked as held out; None for a third of them, at
+            least one if there are several.
+        force: Whether to simulate although it needs more resources than this machine has.
     """
 
     system: str = ""
@@ -88,9 +88,9 @@ class SimulatedRecording:
     """A recording made by simulation.
 
     Attributes:
-        recording: what a real one would tell.
-        truth: what made it, as TOML tables.
-        simulator: that made it.
+        recording: The recording, as a real one would be.
+        truth: The true parameters and settings, as TOML tables.
+        simulator: Simulator that made the recording.
     """
 
     recording: Recording
@@ -99,13 +99,16 @@ class SimulatedRecording:
 
     @check_arguments
     def write(self, path: str | Path) -> list[Path]:
-        """Write the table, its description and its truth: all three or none; returns their paths.
+        """Write the table, its description and its truth, either all three or none.
 
         Args:
-            path: ``NAME.csv``; the others are NAME.toml and NAME.truth.toml beside it.
+            path: Path ``NAME.csv``; NAME.toml and NAME.truth.toml are written in the same folder.
+
+        Returns:
+            Paths of the three files.
 
         Raises:
-            InputError: a file exists already, or cannot be written.
+            InputError: A file exists already, or cannot be written.
         """
         import tomli_w
 
@@ -117,10 +120,10 @@ class SimulatedRecording:
 
 
 def ready(out: Path) -> None:
-    """Refuse a path that cannot be written to, before the work, which may take minutes.
+    """Reject an output path that cannot be used, before the work, which may take minutes.
 
     Raises:
-        InputError: it is no ``NAME.csv``, or a file exists already.
+        InputError: It does not end in ``.csv``, or a file exists already.
     """
     refuse_existing([out, out.with_suffix(".toml"), _truth_of(out)])
 
@@ -132,16 +135,16 @@ def _truth_of(out: Path) -> Path:
 
 
 def make(wish: Wish) -> SimulatedRecording:
-    """Simulate the recording.
+    """Simulate a recording.
 
     Raises:
-        InputError: something in the wish cannot be.
+        InputError: The specification contains something impossible.
     """
     return _Maker(wish).make()
 
 
 class _Maker:
-    """A wish, checked."""
+    """A checked specification, and its simulation."""
 
     def __init__(self, wish: Wish) -> None:
         self.wish = wish
@@ -171,7 +174,7 @@ class _Maker:
         runs = tuple(self._run(int(name), scenario) for name, scenario in scenarios.items())
         stated = {name: sigma for name, sigma in self.noise.items() if sigma}
         constants, system = self.simulator.constant_values, self.name
-        path = Path(f"{system}-simulated.csv")  # a name for messages; nothing lies there
+        path = Path(f"{system}-simulated.csv")  # Used in messages only; there is no such file.
         model = self.wish.model and ModelFile(Path(self.wish.model), self.wish.actuators, {})
         title = f"{system}, simulated"
         recording = Recording(path, system, title, constants, stated, runs, model=model or None)
@@ -201,8 +204,9 @@ class _Maker:
         return self.kind(values, observe)
 
     def _scenario(self, number: int) -> Scenario:
-        """Run `number`; each of its draws has a stream of its own, so that none depends on what
-        else there is.
+        """Build the scenario of run `number`.
+
+        Each random draw has its own stream, so that no draw depends on any other.
         """
         initial = {
             name: low if low == high else self._rng("initial", name, number).uniform(low, high)
@@ -225,7 +229,7 @@ class _Maker:
             rng = self._rng("noise", name, number)
             channels[name] = values + sigma * rng.standard_normal(values.size)
         held_out = number > self.wish.runs - self.held_out
-        # where a body floats nobody estimates, so that it is no secret
+        # The pose of a floating body is never estimated, so it need not be hidden.
         states = {**self.kind.states, **scenario.initial}
         begun = {name: states[name] for name in afloat(self.kind)}
         return Run(str(number), self.times, channels, scenario.inputs, {}, begun, held_out)
@@ -235,7 +239,7 @@ class _Maker:
 
 
 def _kind(wish: Wish) -> type[Simulator]:
-    """The simulator that makes it."""
+    """Return the simulator class of a specification."""
     if bool(wish.system) == (wish.model is not None):
         found = "both" if wish.system else "neither"
         raise InputError(f"expected a system (see `simgap list systems`) or a model, found {found}")
@@ -243,7 +247,10 @@ def _kind(wish: Wish) -> type[Simulator]:
 
 
 def _usual(kind: type[Simulator]) -> UsualRecording:
-    """Of its system; an extended simulator shows what the recording had that it was fitted to."""
+    """Return the default recording of a simulator's system.
+
+    An extended simulator records the channels of the recording that it was fitted to.
+    """
     if not issubclass(kind, Simulated):
         return UsualRecording()
     usual = kind.system.usual_recording
@@ -251,11 +258,11 @@ def _usual(kind: type[Simulator]) -> UsualRecording:
 
 
 def _held_out(wish: Wish) -> int:
-    """How many of the last runs are marked."""
+    """Return how many of the last runs are held out."""
     if wish.runs < 1:
         raise InputError(f"runs = {wish.runs}: expected at least 1")
     if wish.held_out is None:
-        # A single run is divided by whoever reads it.
+        # A single run is divided when it is read.
         return 0 if wish.runs == 1 else max(1, wish.runs // 3)
     if not 0 <= wish.held_out < wish.runs:
         raise InputError(f"held_out = {wish.held_out}: expected fewer than the {wish.runs} runs")
@@ -274,12 +281,12 @@ def _samples(wish: Wish) -> int:
 
 
 def _times(samples: int, rate: float) -> Array:
-    # Rounded as they will stand in the table, so that what is read back is what was simulated.
+    # Round as in the table, so that the times read back are the times simulated.
     return np.array([float(f"{t:.{_DIGITS}g}") for t in (np.arange(samples) / rate).tolist()])
 
 
 def _theta(given: Mapping[str, float] | Sequence[float], kind: type[Simulator]) -> dict[str, float]:
-    """Every parameter's value by name, in the simulator's order."""
+    """Return every parameter's value by name, in the simulator's order."""
     names = [p.name for p in kind.parameters]
     if not isinstance(given, Mapping):
         if len(given) != len(names):
@@ -301,7 +308,7 @@ def _theta(given: Mapping[str, float] | Sequence[float], kind: type[Simulator]) 
 
 
 def _coefficients(name: str, given: Coefficients, kind: type[Simulator]) -> list[float]:
-    """An effect's coefficients in order; those that are not named are zero."""
+    """Return an effect's coefficients in order; coefficients that are not named are zero."""
     if isinstance(given, Mapping):
         of_system = (
             library.find(name, kind.system).on(kind.system) if issubclass(kind, Simulated) else ()
@@ -314,7 +321,7 @@ def _coefficients(name: str, given: Coefficients, kind: type[Simulator]) -> list
 
 
 def _of_family(name: str, values: list[float], kind: type[Simulator]) -> list[float]:
-    """The coefficients of a family, where those of one place are given: the same at every place."""
+    """Repeat the coefficients of one place for all places of an effect family."""
     if not name.endswith("@*") or not issubclass(kind, Simulated):
         return values
     effect = library.find(name, kind.system)
@@ -325,7 +332,7 @@ def _of_family(name: str, values: list[float], kind: type[Simulator]) -> list[fl
 
 
 def _noise(given: float | Mapping[str, float], channels: Sequence[str]) -> dict[str, float]:
-    """1 sigma of every recorded channel."""
+    """Return 1 sigma of every recorded channel."""
     named = given if isinstance(given, Mapping) else {EVERY: given}
     known("recorded channel", [name for name in named if name != EVERY], channels)
     rest = named.get(EVERY, 0.0)
@@ -337,7 +344,7 @@ def _noise(given: float | Mapping[str, float], channels: Sequence[str]) -> dict[
 
 
 def _range(name: str, given: float | tuple[float, float]) -> tuple[float, float]:
-    """Lowest and highest initial value."""
+    """Return the lowest and highest initial value."""
     ends = (given, given) if isinstance(given, int | float) else tuple(given)
     if len(ends) != 2:
         raise InputError(f"initial state {name}: expected a value or (low, high), found {given!r}")

@@ -1,4 +1,4 @@
-"""What recordings would need that are simulated, explained or filmed; see `bench.sizes`."""
+"""Refuse recordings that are too large to simulate, fit or film; see `bench.sizes`."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from sims.base import Simulator
 from sims.recording.recording import Recording
 
 _CELL = 8
-"""Bytes of a number in a table."""
+"""Size of a number in a table, in bytes."""
 _CELL_SECONDS = 1e-7
-"""Seconds to write a number."""
+"""Time to write a number, in seconds."""
 _RUN_MEMORY = 3000
-"""Bytes of a run beside its samples."""
+"""Memory of a run in addition to its samples, in bytes."""
 _LANES = 10
-"""Simulations that are made at once, at the least, to fit a run."""
+"""Minimum number of simultaneous simulations for fitting a run."""
 _FITTING = 100
-"""Simulations of a run that are made to fit it, at the least."""
+"""Minimum number of simulations of a run for fitting it."""
 _PIXEL = 100
-"""Bytes of memory for a pixel of a picture that is drawn."""
+"""Memory per pixel of a rendered image, in bytes."""
 _PIXEL_SECONDS = 1e-8
-"""Seconds to draw a pixel."""
+"""Time to render a pixel, in seconds."""
 
 
 def check_simulated(
     runs: int, samples: int, seconds: float, simulator: Simulator, force: bool = False
 ) -> None:
-    """Refuse a recording whose simulation is hopeless on this machine.
+    """Refuse a recording that this machine cannot simulate.
 
     Args:
-        runs: of it.
-        samples: of each run.
-        seconds: that each lasts.
-        simulator: that makes it.
-        force: whether the user insists.
+        runs: Number of runs.
+        samples: Number of samples of each run.
+        seconds: Duration of each run.
+        simulator: Simulator of the recording.
+        force: Whether the user insists.
 
     Raises:
-        InputError: it needs more than there is, in one line.
+        InputError: It needs more than is available; the message is one line.
     """
     columns = 1 + len(simulator.inputs) + len(simulator.channels)
     steps = max(seconds / largest_step(simulator), samples)
@@ -54,7 +54,7 @@ def check_simulated(
     need = Need(
         f"{runs:.4g} runs of {samples:.4g} samples and {steps:.3g} steps",
         "lower runs, seconds or rate",
-        # As numbers, and as the text of the table before it is written.
+        # The samples exist as numbers, and as the text of the table before it is written.
         memory=cells * (NUMBER + _CELL) + runs * _RUN_MEMORY + steps * STEP_BYTES,
         disk=cells * _CELL,
         steps=steps,
@@ -64,15 +64,15 @@ def check_simulated(
 
 
 def check_recording(recording: Recording, simulator: Simulator, force: bool = False) -> None:
-    """Refuse a recording that no machine like this one can fit.
+    """Refuse a recording that this machine cannot fit.
 
     Args:
-        recording: what is explained or scored.
-        simulator: that would be fitted.
-        force: whether the user insists.
+        recording: Recording to explain or score.
+        simulator: Simulator to fit.
+        force: Whether the user insists.
 
     Raises:
-        InputError: it needs more than there is, in one line.
+        InputError: It needs more than is available; the message is one line.
     """
     longest = max(float(run.times[-1] - run.times[0]) for run in recording.runs)
     steps = longest / largest_step(simulator)
@@ -88,16 +88,16 @@ def check_recording(recording: Recording, simulator: Simulator, force: bool = Fa
 
 
 def check_film(recording: Path, frames: int, pixels: int, force: bool = False) -> None:
-    """Refuse a film that is hopeless on this machine.
+    """Refuse a film that this machine cannot render.
 
     Args:
-        recording: what is filmed.
-        frames: pictures.
-        pixels: width and height of each.
-        force: whether the user insists.
+        recording: Path of the recording to film.
+        frames: Number of images.
+        pixels: Width and height of each image.
+        force: Whether the user insists.
 
     Raises:
-        InputError: it needs more than there is, in one line.
+        InputError: It needs more than is available; the message is one line.
     """
     area = float(pixels) ** 2
     need = Need(

@@ -1,18 +1,18 @@
-"""Whether a recording's stamps can be seconds: its motion against what its system could do.
+"""Check that time stamps can be seconds: compare the motion with what the system could do.
 
-Over how long a coordinate moves is told twice. The recording says: the shortest lag T after which
-its values x differ by as much as they spread,
+The time in which a coordinate moves is estimated twice. From the recording: the shortest lag T
+after which its values x differ by as much as their spread,
 
     mean (x(t + T) - x(t))^2 >= var x                                      (1)
 
-and the system says: at rest in the recorded positions, driven by the recorded inputs, its own
-forces would move it as far within
+and from the system: at rest in the recorded positions, driven by the recorded inputs, its own
+forces would move it equally far within
 
     T' = (var x / mean a^2)^(1/4)                                          (2)
 
-with a its acceleration at nominal parameters. An oscillation has T = 1.05/w and T' = 1/w. Dust,
-friction and a wrong mass change their ratio a few times, milliseconds called seconds a thousand
-times; then the samples lie further apart than (2), too, which nobody would record on purpose.
+with its acceleration a at nominal parameters. An oscillation has T = 1.05/w and T' = 1/w. Dust,
+friction and a wrong mass change the ratio a few times, milliseconds read as seconds a thousand
+times; then the sampling interval exceeds (2), too, which nobody would record on purpose.
 """
 
 from __future__ import annotations
@@ -32,35 +32,39 @@ from sims.simulated import Simulated
 from sims.system import Moment, System
 
 FACTOR = 300.0
-"""Ratio of the two times beyond which the unit of one is wrong."""
+"""Ratio of the two times (1) and (2) above which a unit is wrong."""
 DRIVEN = 10.0
-"""A driven system may be moved as slowly as one likes: its samples must lie so much further apart
-than (2) until it is certain.
+"""Minimum ratio of the sampling interval to (2) for a certain anomaly of a driven system.
+
+A driven system may be moved arbitrarily slowly.
 """
 STILL = 0.01
-"""Share of its usual size by which a coordinate moves at least, so that it tells something."""
+"""Minimum spread of a coordinate for this check, as a fraction of its usual size."""
 GAP = 100.0
-"""Times all the rest of a run that a gap in it takes, and nothing known before it tells of what is
-behind.
+"""Ratio of a gap to the rest of its run above which the run is rejected.
+
+The samples before such a gap do not determine the motion after it.
 """
 _FEW = 10
-"""Samples of a run of which nothing is said."""
+"""Minimum number of samples of a run that is checked."""
 _UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
 def refuse_odd(recording: Recording, kind: type[Simulator], force: bool = False) -> list[str]:
-    """Refuse stamps that cannot be seconds, and positions that cannot be a robot's; what may be is
-    returned to be said.
+    """Reject impossible time stamps and impossible robot positions; return lesser anomalies.
 
     Args:
-        recording: as it was read.
-        kind: a simulator of its system.
-        force: whether the user insists.
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
+        force: Whether the user insists.
+
+    Returns:
+        Texts of the anomalies, to be shown to the user.
 
     Raises:
-        InputError: they cannot be, in one line.
+        InputError: An anomaly is certain and `force` is False; the message is one line.
     """
-    # Positions of a wrong unit make stamps look odd, and not the other way round.
+    # Positions first: their wrong units make stamps look implausible, but not vice versa.
     found = [
         *odd_logs(recording),
         *poses.odd_poses(recording, kind),
@@ -80,7 +84,12 @@ def odd_logs(recording: Recording) -> Iterator[Oddity]:
 
 
 def oddities(recording: Recording, kind: type[Simulator]) -> Iterator[Oddity]:
-    """What is odd, at most one a run."""
+    """Yield the anomalies of time stamps, at most one for each run.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+    """
     for run in recording.runs:
         if run.times.size < _FEW:
             continue
@@ -102,11 +111,12 @@ def _gap(run: Run) -> Oddity | None:
 
 
 def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Oddity | None:
-    """The oddity of a run in which every coordinate moves far more slowly than its system would, or
-    far faster. All coordinates share the stamps, so one that moves as expected clears them; another
-    may belong to a link without inertia in the model file.
+    """Find a run in which every coordinate moves far more slowly or far faster than expected.
+
+    All coordinates share the stamps, so a coordinate that moves as expected clears them; another
+    one may belong to a link without inertia in the model file.
     """
-    # What steps itself tells nobody its forces.
+    # The forces of a system with its own stepping are not accessible.
     if not issubclass(kind, Simulated) or (kind.own_engine and not kind.has_model):
         return None
     system = kind.system()
@@ -115,7 +125,7 @@ def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Oddity | Non
         accelerations = poses.accelerations(run, kind)
     else:
         accelerations = _accelerations(recording, run, system)
-    # A servo stands still by force: what would move it is nothing to wonder about.
+    # A servo holds its position by force, so large forces at rest are normal.
     servo = kind.has_model and _driven(run)
     sizes = {channel.name: channel.scale for channel in system.channels}
     first: Oddity | None = None
@@ -127,7 +137,7 @@ def _slow(recording: Recording, run: Run, kind: type[Simulator]) -> Oddity | Non
         pull = float(np.sqrt(np.nanmean(accelerations[:, column] ** 2)))
         if not (spread > STILL * sizes.get(name, 1.0) and pull > 0):
             continue
-        own = (spread / pull) ** 0.5  # (2)
+        own = (spread / pull) ** 0.5  # Equation (2).
         recorded = interval * _lag(x)
         ratio = recorded / own
         if 0 < ratio < 1 / FACTOR:
@@ -150,7 +160,7 @@ def _driven(run: Run) -> bool:
 
 
 def _accelerations(recording: Recording, run: Run, system: System) -> Array:
-    """(T, D) what the system's own forces do at rest in the recorded positions."""
+    """Compute (T, D) accelerations by the system's own forces, at rest in recorded positions."""
     count = run.times.size
     given = {**recording.constants, **run.constants}
     constants = {c.name: np.full((count, 1), given.get(c.name, c.value)) for c in system.constants}
@@ -171,8 +181,10 @@ def _accelerations(recording: Recording, run: Run, system: System) -> Array:
 
 
 def _lag(x: Array) -> float:
-    """The lag of (1) in samples; 0 where the first one is beyond it already, and the motion between
-    samples is not seen.
+    """Return the lag of (1) in samples.
+
+    Returns 0 if the first lag exceeds the spread already, since motion between samples is not
+    recorded.
     """
     variance = float(np.nanvar(x))
     lag, before = 1, 0

@@ -1,10 +1,10 @@
 """Thin recordings of robots that are sampled much faster than they move.
 
-Neighbouring samples of a slow motion have the same rounding errors of an encoder and the same
-vibrations, which no model of the robot has: at 500 Hz and more they, and not the motion, decide a
-likelihood. Each k-th sample is kept, with k as large as these hold everything that moves: the
-others follow from a cubic spline through them (C. de Boor, A Practical Guide to Splines, 1978,
-chapter 4) as well as from one through every second sample.
+Neighbouring samples of a slow motion share the rounding errors of an encoder and vibrations that no
+model of the robot contains: at 500 Hz and more they, and not the motion, decide a likelihood. Each
+k-th sample is kept, with the largest k that preserves all motion: the other samples follow from a
+cubic spline through the kept ones (C. de Boor, A Practical Guide to Splines, 1978, chapter 4) as
+well as from one through every second sample.
 """
 
 from __future__ import annotations
@@ -17,28 +17,30 @@ from sims.base import Array, Simulator
 from sims.recording.recording import Recording, Run
 
 FASTEST = 400.0
-"""Sample rate in Hz up to which a recording is kept as it is."""
+"""Sampling rate in Hz up to which a recording is kept unchanged."""
 SLOWEST = 100.0
-"""Lowest sample rate in Hz after thinning."""
+"""Minimum sampling rate in Hz after thinning."""
 LARGER = 1.25
-"""Factor by which the error of interpolation may grow over that of every second sample."""
+"""Maximum ratio of the interpolation error to that of keeping every second sample."""
 PRECISION = 1e-4
-"""Error of interpolation that does not matter, as a share of a channel's range: the accuracy of a
-simulation.
-"""
+"""Negligible interpolation error as a fraction of a channel's range: a simulation's accuracy."""
 COMPLETE = 0.9
-"""Smallest share of its samples that each channel must have."""
+"""Minimum share of available samples of each channel."""
 FEWEST = 40
-"""Smallest number of samples that each run must keep."""
+"""Minimum number of samples that each run must keep."""
 
 
 def thin(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
-    """Keep each k-th sample of a robot's recording, where these samples contain all motion.
+    """Keep each k-th sample of a robot's recording if these samples contain all motion.
 
-    Inputs that are held take their mean between the samples that are kept.
+    Inputs with zero-order hold are averaged between the samples that are kept.
+
+    Args:
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
 
     Returns:
-        The recording, and a message for the user, which is empty where it is unchanged.
+        The recording, and a message for the user, which is empty if it is unchanged.
     """
     rate = min((_rate(run) for run in recording.runs), default=0.0)
     if not kind.has_model or rate <= FASTEST:
@@ -55,12 +57,12 @@ def thin(recording: Recording, kind: type[Simulator]) -> tuple[Recording, str]:
 
 
 def _rate(run: Run) -> float:
-    """Samples per second."""
+    """Return the sampling rate in Hz."""
     return float(1.0 / np.median(np.diff(run.times))) if run.times.size > 1 else 0.0
 
 
 def _holds(recording: Recording, every: int) -> bool:
-    """Whether every k-th sample holds all motion of all channels."""
+    """Return whether every k-th sample preserves all motion of all channels."""
     for run in recording.runs:
         if run.times.size < FEWEST * every:
             return False
@@ -75,8 +77,8 @@ def _holds(recording: Recording, every: int) -> bool:
 
 
 def _interpolation_error(times: Array, values: Array, every: int) -> float:
-    """RMS error of a cubic spline through every k-th sample at the others."""
-    # Loaded where a robot's recording is that fast.
+    """Return the RMS error of a cubic spline through every k-th sample at the other samples."""
+    # Import SciPy here, since only fast recordings need it.
     from scipy.interpolate import CubicSpline
 
     there = np.isfinite(values)
@@ -91,7 +93,7 @@ def _interpolation_error(times: Array, values: Array, every: int) -> float:
 
 
 def _thinned(run: Run, every: int) -> Run:
-    """Every k-th sample of a run, with the mean of its inputs from each one to the next."""
+    """Keep every k-th sample of a run, and average its inputs from each one to the next."""
     part = run.part(slice(None, None, every))
     first = np.arange(0, run.times.size, every)
     spans = np.diff(run.times, append=run.times[-1] + np.median(np.diff(run.times)))

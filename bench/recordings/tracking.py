@@ -1,4 +1,4 @@
-"""A film tracked: the recording, its description, and a picture of the track."""
+"""Track a film: write the recording, its description, and a figure of the track."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from sims.recording.recording import Recording, Run
 from sims.recording.write import refuse_existing, write_recording
 
 _DIGITS = 9
-"""Of the numbers in the table: more than a pixel's noise has."""
+"""Number of significant digits in the table, finer than a pixel's noise."""
 
 
 class Found(NamedTuple):
-    """What was tracked.
+    """Result of tracking a film.
 
     Attributes:
-        notes: for the user, before anything else.
-        frames: of the part that is recorded.
-        seen: of them, with the ball.
-        how: where metres come from.
-        noise_pixels: 1 sigma of one sample.
-        noise: the same of a height, m.
-        lines: all of it in words.
+        notes: Notes for the user, to be shown first.
+        frames: Number of recorded frames.
+        seen: Number of these frames that show the ball.
+        how: Method by which heights in metres were found.
+        noise_pixels: 1 sigma of one sample in pixels.
+        noise: 1 sigma of a height in metres.
+        lines: The result as text.
     """
 
     notes: tuple[str, ...]
@@ -44,7 +44,7 @@ class Found(NamedTuple):
     lines: tuple[str, ...]
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Return the result as a JSON document."""
         return {
             "frames": self.frames,
             "frames_with_ball": self.seen,
@@ -68,24 +68,24 @@ def write(
     scale: str | None = None,
     pdf: bool = False,
 ) -> Found:
-    """Track `video`; write `out`, its description, and the track's picture beside it.
+    """Track `video`; write `out`, its description, and a figure of the track in the same folder.
 
     Args:
-        video: the film.
-        out: NAME.csv, a new file.
-        draw: makes the picture, see `bench.figures.track.drawn`.
-        diameter: of the ball, m.
-        fps: frames a second instead of the file's time stamps.
-        scale: "camera", "diameter" or "fall"; None for the best there is.
-        pdf: whether `draw` makes a PDF too.
+        video: Path of the film.
+        out: Path NAME.csv of a new file.
+        draw: Function that draws the figure, see `bench.figures.track.drawn`.
+        diameter: Diameter of the ball, m.
+        fps: Frames per second, instead of the file's time stamps.
+        scale: "camera", "diameter" or "fall"; None for the best available one.
+        pdf: Whether `draw` makes a PDF, too.
 
     Raises:
-        InputError: anything that cannot be, in one line.
+        InputError: The film cannot be tracked or the files cannot be written; one line.
     """
     if out.suffix != ".csv":
         raise InputError(f"{out}: expected a name that ends in .csv")
     pictures = [out.with_suffix(ending) for ending in (".png", ".pdf")]
-    # Before the work: tracking a film takes a while.
+    # Check this before the work, since tracking a film takes a while.
     refuse_existing([out, out.with_suffix(".toml"), *pictures[: 2 if pdf else 1]])
     if diameter is not None and not LENGTH[0] <= diameter <= LENGTH[1]:
         wanted = f"more than 0 m, from {LENGTH[0]:g} to {LENGTH[1]:g} m"
@@ -96,7 +96,7 @@ def write(
         seen = track(film)
         heights = _heights(seen, video, diameter, scale)
     except InputError as error:
-        # Some of what can go wrong names the film already, some does not know it.
+        # Some error messages already name the film, others do not.
         text = str(error)
         raise InputError(text if text.startswith(str(video)) else f"{video}: {text}") from None
 
@@ -108,7 +108,7 @@ def write(
         notes.append(f"{until}; what is before that is left out")
     noise = _noise(seen, heights, part)
 
-    # The recording and its pictures are published together: neither is left without the other.
+    # The recording and its figures are published together, so that none exists without the others.
     drawn = draw(seen, heights, part, f"{video.name}: {heights.how}")
     shown = {
         path: content for path, content in zip(pictures, drawn, strict=True) if content is not None
@@ -126,12 +126,12 @@ def write(
 
 
 def _noise(seen: Track, heights: metres.Heights, part: slice) -> float:
-    """1 sigma of a height, m: the larger of what neighbours and what flights scatter by."""
+    """Estimate 1 sigma of a height, m: the larger of the scatter of neighbours and of flights."""
     z = heights.z[part]
     noise = float(np.nanmax([rough(z), metres.scatter(seen.times[part], z), 0.0]))
     if noise > 0:
         return noise
-    # Neither tells in a few frames: that of the pixels, at the scale of the ball's middle size.
+    # A few frames give neither estimate: use the noise in pixels, scaled by the median radius.
     return seen.noise * heights.radius / float(np.nanmedian(seen.radius))
 
 

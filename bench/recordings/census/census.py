@@ -1,5 +1,6 @@
-"""The census of a recording: what its clock, its values and its channels tell of the log itself,
-before any model is asked. Each finding is one line with its remedy.
+"""Run all quality checks of a log: clock, signal values and consistency of channels.
+
+The checks need no fitted model. Each finding is one line with its remedy.
 """
 
 from __future__ import annotations
@@ -13,11 +14,14 @@ from sims.recording.recording import Recording
 
 
 def census(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
-    """Everything found: of the clock, of single signals, of signals beside each other.
+    """Run all quality checks: clock, single signals, and consistency between signals.
 
     Args:
-        recording: as it was read.
-        kind: a simulator of its system.
+        recording: Recording as it was read.
+        kind: Simulator class of its system.
+
+    Returns:
+        Findings in the order of the checks.
     """
     yield from clock.intervals(recording)
     yield from clock.repeated(recording)

@@ -1,4 +1,4 @@
-"""The clock of a recording: intervals that vary, samples that are lost, samples that came twice."""
+"""Check the sampling clock of a recording: jitter, lost samples and repeated samples."""
 
 from __future__ import annotations
 
@@ -11,20 +11,27 @@ from sims.base import Array
 from sims.recording.recording import Recording, Run
 
 JITTER = 0.02
-"""Of an interval, 1 sigma: jitter that is told."""
+"""Smallest jitter that is reported, 1 sigma, as a fraction of the sampling interval."""
 LOST = 0.002
-"""Share of samples that are lost, or came twice, from which on it is told."""
+"""Smallest share of lost or repeated samples that is reported."""
 WHOLE = 0.3
-"""Of an interval: what is so near to several whole ones has lost the samples between."""
+"""Tolerance for lost samples, as a fraction of the sampling interval.
+
+An interval that is so close to a whole multiple of the median interval has lost the samples
+between.
+"""
 FAST = 5.0
-"""Steps of a signal from sample to sample: so fast it cannot stay where it was by chance."""
+"""Smallest change of a signal per sample that counts as fast motion, in quantisation steps.
+
+A signal that changes this fast does not repeat its value by coincidence.
+"""
 SURE = 4.0
-"""Standard deviations beyond chance."""
+"""Detection threshold in standard deviations."""
 _MAD = 1.4826
 
 
 def intervals(recording: Recording) -> Iterator[Finding]:
-    """Jitter and lost samples, each over all runs."""
+    """Find jitter and lost samples, summarised over all runs."""
     jittered, rests, lost, whole, lossy = [], [], 0, 0, []
     for run in recording.runs:
         steps = np.diff(_stamps(run))
@@ -38,7 +45,8 @@ def intervals(recording: Recording) -> Iterator[Finding]:
         if jitter > JITTER:
             jittered.append(run.name)
         gone = int((counts - 1)[np.abs(own) < max(WHOLE, 3.0 * jitter)].sum())
-        # Where the clock jitters much a long interval is lost only if no short one makes up for it.
+        # If the clock jitters strongly, a long interval means a lost sample only if no short
+        # interval compensates for it.
         gone = min(gone, max(int(ratios.sum()) - steps.size, 0))
         if gone < SURE * jitter * steps.size**0.5:
             gone = 0
@@ -62,9 +70,11 @@ def intervals(recording: Recording) -> Iterator[Finding]:
 
 
 def _stamps(run: Run) -> Array:
-    """When the sensor was read that was read most often: among the instants of a run are those of
-    commands and of other sensors, which have clocks of their own. All instants where these are as
-    even: then what the sensor has not is empty cells.
+    """Return the sample times of the sensor that was read most often.
+
+    The sample times of a run also contain those of commands and of other sensors, which have their
+    own clocks. All sample times are returned if they are at least as regular: the missing samples
+    of the sensor are then empty cells.
     """
     seen = [np.isfinite(values) for values in run.channels.values()]
     often = max(seen, key=lambda one: int(one.sum()), default=np.ones(run.times.size, np.bool_))
@@ -73,7 +83,7 @@ def _stamps(run: Run) -> Array:
 
 
 def _uneven(times: Array) -> float:
-    """Share of the steps that are not as long as most are."""
+    """Return the share of intervals that differ from the median interval by more than 1 %."""
     steps = np.diff(times)
     if not steps.size:
         return 1.0
@@ -82,7 +92,7 @@ def _uneven(times: Array) -> float:
 
 
 def repeated(recording: Recording) -> Iterator[Finding]:
-    """Samples that repeat the one before, in every channel at once, while the motion goes on."""
+    """Find samples that repeat the previous one in every channel while the system moves."""
     found, there, runs = 0, 0, []
     for run in recording.runs:
         count, expected = _stale(run)
@@ -100,7 +110,11 @@ def repeated(recording: Recording) -> Iterator[Finding]:
 
 
 def _stale(run: Run) -> tuple[int, float]:
-    """Samples that are as the one before amid fast motion, and how many are so by chance."""
+    """Count samples that repeat the previous one during fast motion.
+
+    Returns:
+        The count, and the count expected by chance.
+    """
     signals = [values for values in run.channels.values() if np.isfinite(values).sum() > 3]
     if not signals or run.times.size < 4:
         return 0, 0.0
@@ -109,18 +123,19 @@ def _stale(run: Run) -> tuple[int, float]:
     around = np.maximum(np.abs(changes[:, :-2]), np.abs(changes[:, 2:]))
     moving = np.nan_to_num(np.max(around, axis=0, initial=0.0), nan=0.0) >= FAST
     stale = same.all(axis=0)[1:-1] & moving
-    # Noise of several steps stays where it was half as often as it goes one step either way.
+    # A signal whose noise spans several steps repeats its value half as often as it changes by one
+    # step in either direction.
     near = (np.abs(np.nan_to_num(changes, nan=9.0)) < 1.5).all(axis=0)[1:-1] & moving
     one = int(near.sum()) - int(stale.sum())
     return int(stale.sum()), one / max(3.0 ** len(signals) - 1.0, 1.0)
 
 
 def _in_steps(values: Array) -> Array:
-    """(T - 1,) changes in units of the signal's smallest one."""
+    """Return the (T - 1,) changes of a signal in units of its smallest change."""
     changes = np.diff(values)
     sizes = np.abs(changes[np.isfinite(changes)])
     moving = sizes[sizes > 1e-9 * np.max(sizes, initial=0.0)]
     if not moving.size:
         return np.zeros_like(changes)
-    # Of a signal without steps the smallest change is a tiny one, and all is fast against it.
+    # A signal without quantisation has a tiny smallest change, so all of its motion counts as fast.
     return np.asarray(np.round(changes / moving.min()), dtype=np.float64)

@@ -1,18 +1,18 @@
-"""Whether the clock of the sensors drifts against that of the commands.
+"""Check whether the clock of the sensors drifts against that of the commands.
 
-What a position y makes of a command u is taken for linear with a finite memory,
+The response of a position y to a command u is modelled as linear with finite memory,
 
-    p(t) = c + d t + sum_k h_k <u>_k(t),  <u>_k the mean of u over the k-th stretch before t   (1)
+    p(t) = c + d t + sum_k h_k <u>_k(t),  <u>_k the mean of u over the k-th interval before t  (1)
 
-so that slow and fast commands each have the lag that the drive gives them. A position that falls
-ever more behind by a share e of the time is
+so that slow and fast commands each have the lag that the drive gives them. A position whose delay
+grows by a share e of the time is
 
     y(t) = p(t - T - e t) = p - (T + e t) p' + ...                                             (2)
 
-and least squares for T and e is the shift at which the two are most alike (cross-correlation's
-maximum, to first order; C. Knapp, G. Carter, IEEE Trans. ASSP 24(4), 320, 1976). The error of e is
-that of sums over blocks longer than the memory, since what (1) leaves is not white (W. Newey,
-K. West, Econometrica 55, 703, 1987).
+Least squares for T and e finds the shift at which the two are most similar (the maximum of the
+cross-correlation, to first order; C. Knapp, G. Carter, IEEE Trans. ASSP 24(4), 320, 1976). The
+standard error of e is computed from sums over blocks longer than the memory, since the residual of
+(1) is not white (W. Newey, K. West, Econometrica 55, 703, 1987).
 """
 
 from __future__ import annotations
@@ -29,21 +29,25 @@ from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 
 GRID = 8000
-"""Instants of a run, at most, at which the two are compared."""
+"""Maximum number of times of a run at which command and position are compared."""
 EDGES = (-2, -1, 0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
-"""Bounds of the stretches of (1), in instants before the one in question."""
+"""Bounds of the intervals of equation (1), in grid steps before the time considered."""
 BLOCKS = 4
-"""Blocks of a run, without which it tells nothing of its error."""
+"""Minimum number of blocks of a run for estimating the standard error of its drift."""
 FEW = (9.0, 9.0, 9.0, 2.7, 1.9, 1.6, 1.43, 1.35, 1.3, 1.25, 1.2, 1.18, 1.16, 1.14, 1.12, 1.1, 1.05)
-"""Times the error that so few blocks tell is too small (Student's t at 95 %, one block lost)."""
+"""Correction factors of the standard error, indexed by the number of blocks.
+
+They are the factors by which an error from few blocks is too small (Student's t at 95 %, one block
+lost).
+"""
 ROUGH = 0.01
-"""Share of the drift that (2) leaves out."""
+"""Relative error of the drift from truncating equation (2)."""
 LIKE = 0.9
-"""Share of a position's variance that (1) explains at least."""
+"""Minimum share of a position's variance that equation (1) must explain."""
 LEAST = 2e-5
-"""Drift that is told: clocks of ordinary quartz differ by less."""
+"""Smallest reported drift (dimensionless); ordinary quartz clocks differ by less."""
 SURE = 4.0
-"""Standard deviations beyond chance."""
+"""Detection threshold in standard deviations."""
 
 
 class _Estimate(NamedTuple):
@@ -52,7 +56,15 @@ class _Estimate(NamedTuple):
 
 
 def drifts(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
-    """The drift over all runs and driven coordinates, where there is one."""
+    """Find the clock drift, pooled over all runs and driven coordinates, if it is significant.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        At most one finding.
+    """
     found = [
         estimate
         for command, position in _driven(kind)
@@ -75,7 +87,7 @@ def drifts(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
 
 
 def _driven(kind: type[Simulator]) -> list[tuple[str, str]]:
-    """Inputs with the positions that follow them."""
+    """Return pairs of an input and a position that follows it."""
     if not issubclass(kind, Simulated):
         return []
     if kind.has_model:
@@ -85,7 +97,7 @@ def _driven(kind: type[Simulator]) -> list[tuple[str, str]]:
 
 
 def _estimate(run: Run, command: str, position: str) -> Iterator[_Estimate]:
-    """(2) of one run; nothing where (1) does not explain it."""
+    """Estimate the drift of one run by equation (2); yield nothing if (1) explains too little."""
     t, u, y = run.times, run.inputs[command], run.channels[position]
     seen = np.isfinite(y)
     if seen.sum() < 2 * len(EDGES) or not (np.nanstd(y) > 0 and np.std(u) > 0):
@@ -101,7 +113,7 @@ def _estimate(run: Run, command: str, position: str) -> Iterator[_Estimate]:
         return
     smooth = np.column_stack([np.ones_like(time), time, memory])
     answer, *_ = np.linalg.lstsq(smooth, own, rcond=1e-10)
-    predicted = smooth @ answer  # (1)
+    predicted = smooth @ answer  # Equation (1).
     if np.var(own - predicted) > (1.0 - LIKE) * np.var(own):
         return
     rate = np.gradient(predicted, step)
@@ -119,7 +131,7 @@ def _estimate(run: Run, command: str, position: str) -> Iterator[_Estimate]:
 
 
 def _memory(u: Array) -> Array:
-    """(N, K) means of a command over the stretches of (1)."""
+    """Return the (N, K) means of a command over the intervals of equation (1)."""
     total = np.concatenate([[0.0], np.cumsum(u)])
     at = np.arange(u.size)
     columns = []
@@ -130,7 +142,7 @@ def _memory(u: Array) -> Array:
 
 
 def _pooled(found: list[_Estimate]) -> _Estimate:
-    """Their mean by weight; where they scatter more than their errors say, with that scatter."""
+    """Return the weighted mean; scale its error up if estimates scatter more than their errors."""
     drifts, errors = np.array(found).T
     weights = np.maximum(errors, 1e-12) ** -2.0
     drift = float(weights @ drifts / weights.sum())

@@ -1,4 +1,4 @@
-"""What a census of a recording finds."""
+"""Result of one quality check of a recording."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 
 class Finding(NamedTuple):
-    """One finding.
+    """One finding of a quality check.
 
     Attributes:
         about: clock, drift, quantisation, saturation, stillness or contradiction.
-        text: what was found, with its number.
-        remedy: what to do about it.
+        text: Description of the finding, with its number.
+        remedy: Recommended action.
     """
 
     about: str
@@ -21,12 +21,17 @@ class Finding(NamedTuple):
 
     @property
     def line(self) -> str:
-        """All of it."""
+        """The complete finding in one line."""
         return f"{self.about}: {self.text}; {self.remedy}"
 
 
 def named(names: Iterable[str], most: int = 4) -> str:
-    """Some names, each once, in words."""
+    """Format a list of names, each once, and the number of names beyond the first few.
+
+    Args:
+        names: Names, possibly repeated.
+        most: Maximum number of names that are written out.
+    """
     each = list(dict.fromkeys(names))
     more = len(each) - most
     return ", ".join(each[:most]) + (f" and {more} more" if more > 0 else "")

@@ -1,15 +1,16 @@
-"""Channels that contradict each other: a velocity that is not the derivative of its position.
+"""Check velocities that contradict the derivative of their position.
 
-Over a stretch of samples a position q goes as far as its velocity v adds up to,
+Over an interval of several samples, the change of a position q equals the integral of its velocity
+v,
 
     dq = q_b - q_a,    s = integral of v from a to b (trapezoids),    g = <dq s> / <s^2>      (1)
 
-g is 1 where both are right, -1 where one sign is wrong, 57.3 where one is in degrees. A velocity
-that is filtered, or stamped late, follows the derivative later by
+g is 1 if both are right, -1 if one sign is wrong, 57.3 if one is in degrees. A velocity that is
+filtered, or stamped late, lags the derivative by
 
     T = -<(s - dq) dv> / <dv^2>,    dv = v_b - v_a                                             (2)
 
-since s falls behind dq by T dv to first order.
+since s lags dq by T dv to first order.
 """
 
 from __future__ import annotations
@@ -26,27 +27,35 @@ from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 
 OFF = 0.05
-"""Of (1): a slope that is off by so much is told, if it is also off beyond chance."""
+"""Smallest reported deviation of the slope g in equation (1) from 1, if it is also significant."""
 LIKE = 0.8
-"""Correlation below which a velocity has nothing to do with its position."""
+"""Correlation below which a velocity is unrelated to its position."""
 LATE = 0.5
-"""Intervals: (2) that is told."""
+"""Smallest reported lag T of equation (2), in sampling intervals."""
 SURE = 4.0
-"""Standard deviations beyond chance."""
+"""Detection threshold in standard deviations."""
 STRETCH = 5
-"""Samples of a stretch, at least."""
+"""Minimum number of samples in an interval of integration."""
 SEEN = 10.0
-"""Noises by which a position changes over a stretch, if it can be."""
+"""Wanted change of a position over an interval of integration, in standard deviations of noise."""
 _UNITS = {180.0 / np.pi: "degrees", 1e3: "thousandths"}
-"""Ratios that a wrong unit makes."""
+"""Ratios of velocity to position derivative that a wrong unit causes, and the unit."""
 
 
 def contradictions(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
-    """Velocities that are not the derivative of their position, by sign, unit, size or time."""
+    """Find velocities that differ from their position's derivative in sign, unit, size or time.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        One finding for each contradicting pair of position and velocity.
+    """
     if not issubclass(kind, Simulated):
         return
     system = kind.system
-    # not strict: behind the coordinates' rates, an own system may have other states
+    # Not strict: an own system may have further states after the rates of the coordinates.
     for position, rate in zip(system.coordinates, system.rates, strict=False):
         runs = [run for run in recording.runs if {position, rate} <= run.channels.keys()]
         if runs:
@@ -54,7 +63,7 @@ def contradictions(recording: Recording, kind: type[Simulator]) -> Iterator[Find
 
 
 class _Stretches(NamedTuple):
-    """dq, s, dv of (1) and (2), and the length of an interval."""
+    """Values dq, s, dv of equations (1) and (2) per interval, and the sampling interval in s."""
 
     gone: Array
     added: Array
@@ -76,7 +85,8 @@ def _pair(runs: list[Run], position: str, rate: str) -> Iterator[Finding]:
             "is it of another joint? correct the columns, or leave it out",
         )
         return
-    # Noise of the one makes (1) too small, noise of the other its inverse: the truth lies between.
+    # Noise of the velocity makes (1) too small, noise of the position makes its inverse too small:
+    # the true slope lies between.
     slope, other = along / power, float(gone @ gone) / along
     rest = gone - slope * added
     doubt = float(np.sqrt(rest @ rest / max(gone.size - 1, 1) / power))
@@ -96,7 +106,7 @@ def _pair(runs: list[Run], position: str, rate: str) -> Iterator[Finding]:
 
 
 def _remedy(ratio: float, rate: str) -> str:
-    """What to do about velocities that are wrong by a ratio, as its logarithm."""
+    """Recommend a correction for a velocity that is wrong by a ratio, given as its logarithm."""
     for factor, word in _UNITS.items():
         if abs(ratio - np.log(factor)) < 0.1:
             return f"one of the two is in {word}: correct its unit"
@@ -104,8 +114,12 @@ def _remedy(ratio: float, rate: str) -> str:
 
 
 class Late(NamedTuple):
-    """How far a velocity follows behind the derivative of its position: seconds, their error
-    (1 sigma), and samples without sign.
+    """Lag of a velocity behind the derivative of its position.
+
+    Attributes:
+        seconds: Lag in seconds; negative if the velocity leads.
+        error: Standard error of the lag (1 sigma), s.
+        samples: Absolute lag in sampling intervals.
     """
 
     seconds: float
@@ -114,13 +128,20 @@ class Late(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Whether it follows or leads."""
+        """Wording for the sign of the lag: behind or ahead of."""
         return "behind" if self.seconds > 0 else "ahead of"
 
 
 def late(runs: list[Run], position: str, rate: str) -> Late | None:
-    """How far a velocity, right by sign and unit, is behind; None where it is not, or cannot be
-    told.
+    """Estimate the lag of a velocity whose sign and unit are right.
+
+    Args:
+        runs: Runs with both channels.
+        position: Name of the position channel.
+        rate: Name of the velocity channel.
+
+    Returns:
+        The lag, or None if it is not significant or cannot be estimated.
     """
     found = _stretches(runs, position, rate)
     if found is None:
@@ -129,7 +150,7 @@ def late(runs: list[Run], position: str, rate: str) -> Late | None:
 
 
 def _late(found: _Stretches, slope: float) -> Late | None:
-    """(2), where it is told."""
+    """Estimate the lag by equation (2); None if it is not significant."""
     gone, added, faster, interval = found
     behind = slope * added - gone
     power = float(faster @ faster)
@@ -144,8 +165,9 @@ def _late(found: _Stretches, slope: float) -> Late | None:
 
 
 def _stretches(runs: list[Run], position: str, rate: str) -> _Stretches | None:
-    """Stretches over which the position changes well beyond its noise; None if there are too
-    few.
+    """Compute the integrals over intervals in which the position changes well beyond its noise.
+
+    Returns None if there are too few intervals.
     """
     noise = estimated((run.times, run.channels[position]) for run in runs)
     sigma = max(float(np.nan_to_num(noise.sigma)), noise.step)
@@ -158,7 +180,8 @@ def _stretches(runs: list[Run], position: str, rate: str) -> _Stretches | None:
     usual = float(np.sqrt(np.nanmean(moves**2))) if np.isfinite(moves).any() else 0.0
     if not usual > 0:
         return None
-    # Long enough to be seen, and no longer: over a whole swing the two add up to nothing.
+    # Long enough to exceed the noise, but no longer: over a whole oscillation both integrals
+    # vanish.
     length = int(np.clip(np.ceil(SEEN * sigma / usual), STRETCH, 50))
     parts = [_of(run, position, rate, length) for run in runs]
     gone, added, faster = (np.concatenate(rows) for rows in zip(*parts, strict=True))
@@ -174,7 +197,7 @@ def _of(run: Run, position: str, rate: str, length: int) -> tuple[Array, Array, 
     ends = np.arange(0, q.size, length)
     if ends.size < 2:
         return np.empty(0), np.empty(0), np.empty(0)
-    # A sample that is missing spoils the stretch that it lies in, and no other.
+    # A missing sample invalidates only the interval that contains it.
     added = np.add.reduceat(areas, ends[:-1])
     added[-1] = areas[ends[-2] : ends[-1]].sum()
     return np.diff(q[ends]), added, np.diff(v[ends])

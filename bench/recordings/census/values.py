@@ -1,4 +1,4 @@
-"""Single signals: steps of quantisation, ends where they saturate, stretches that stand still."""
+"""Check single signals: quantisation, saturation and standstill."""
 
 from __future__ import annotations
 
@@ -14,23 +14,34 @@ from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 
 COARSE = 0.02
-"""Of a signal's range: steps that are told."""
+"""Smallest reported quantisation step, as a fraction of the signal's range."""
 FLAT = 5
-"""Samples in a row at the very end of a range, that are no coincidence."""
+"""Minimum number of consecutive samples at the end of a range that counts as saturation."""
 CLIPPED = 2.5
-"""Steps of quantisation by which a signal comes to an end or leaves it, where it is cut there."""
+"""Minimum jump of a signal into or out of saturation, in quantisation steps."""
 FEW = 0.005
-"""Share of samples from which on a flat end is told."""
+"""Smallest reported share of samples at a saturated end."""
 STILL = 0.5
-"""Share of samples from which on stillness is told."""
+"""Smallest reported share of samples at standstill."""
 WINDOW = 20
-"""Samples over which something stands still or moves."""
+"""Number of samples of a window in which a signal is judged to move or stand still."""
 NOISES = 6.0
-"""Range within a window, in noises, from which on it moves: of noise alone it is 3.7 on average."""
+"""Smallest range within a window that counts as motion, in standard deviations of noise.
+
+Noise alone has a range of 3.7 standard deviations on average.
+"""
 
 
 def steps(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
-    """Channels whose rounding hides the motion, or the noise that is stated for them."""
+    """Find channels whose quantisation exceeds their motion or their specified noise.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        One finding for each such channel.
+    """
     for channel, signals in _signals(recording, kind):
         step = estimated(signals).step
         values = np.concatenate([values for _, values in signals])
@@ -55,7 +66,15 @@ def steps(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
 
 
 def saturated(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
-    """Channels with a flat end, and commands at the end of their range."""
+    """Find channels that are cut off at an end of their range, and commands at their limits.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        One finding for each saturated end and each limited command.
+    """
     for channel, signals in _signals(recording, kind):
         for sign, word in ((1.0, "highest"), (-1.0, "lowest")):
             values = [sign * own for _, own in signals if np.isfinite(own).any()]
@@ -97,7 +116,15 @@ def _commands(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
 
 
 def still(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
-    """Coordinates that move in few samples or in none."""
+    """Find coordinates that move in few samples or never.
+
+    Args:
+        recording: Recording to check.
+        kind: Simulator class of its system.
+
+    Returns:
+        At most two findings: coordinates that never move, and coordinates that seldom move.
+    """
     if not issubclass(kind, Simulated):
         return
     never, seldom = [], []
@@ -130,7 +157,7 @@ def still(recording: Recording, kind: type[Simulator]) -> Iterator[Finding]:
 def _signals(
     recording: Recording, kind: type[Simulator]
 ) -> Iterator[tuple[Channel, list[tuple[Array, Array]]]]:
-    """Each recorded channel with its times and values in every run."""
+    """Yield each recorded channel with its times and values in every run."""
     for channel in kind.channels:
         signals = [(run.times, run.channels[channel.name]) for run in _with(recording, channel)]
         if signals:
@@ -142,8 +169,10 @@ def _with(recording: Recording, channel: Channel) -> list[Run]:
 
 
 def _flat(values: Array, end: float, jump: float) -> int:
-    """Samples in rows of at least `FLAT` at the very end, into which or out of which the signal
-    jumps: one in steps that turns back at its end comes and goes by a step.
+    """Count samples in saturated stretches of at least `FLAT` samples.
+
+    The signal must jump into or out of a stretch: a quantised signal that reverses at its end
+    changes by one step only.
     """
     at = np.concatenate([[False], values == end, [False]]).astype(np.int8)
     edges = np.flatnonzero(np.diff(at))
@@ -155,13 +184,13 @@ def _flat(values: Array, end: float, jump: float) -> int:
 
 
 def _stands(values: Array, end: float) -> bool:
-    """Whether a run is at this value from its first sample on, or to its last: it rests there."""
+    """Return whether a run begins or ends at this value, or never takes it: it is at rest there."""
     seen = values[np.isfinite(values)]
     return bool(seen.size and (seen[0] == end or seen[-1] == end)) or not (values == end).any()
 
 
 def _moving(values: Array, least: float) -> Array:
-    """Of each window of a run, whether it moves."""
+    """Return for each window of a run whether the signal moves in it."""
     count = values.size // WINDOW
     if not count:
         return np.array([bool(np.nanmax(values) - np.nanmin(values) > least)])
