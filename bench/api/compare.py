@@ -1,6 +1,4 @@
-"""`simgap.compare` and `simgap.sweep`: experiments from Python, their results as tables and
-figures.
-"""
+"""Python API: `simgap.compare` and `simgap.sweep`, with results as tables and figures."""
 
 from __future__ import annotations
 
@@ -64,23 +62,23 @@ _OF_TWO = {
 }
 """Columns of the tables of a study of a missing effect."""
 _ROWS = 200
-"""Rows of a table that a notebook shows."""
+"""Maximum number of table rows that a notebook shows."""
 
 
 ExperimentSource: TypeAlias = Annotated[
     str | Path | Experiment,
     Expected("the name of an experiment, the path of its TOML file or an Experiment"),
 ]
-"""What is compared."""
+"""The experiment to run."""
 Tuners: TypeAlias = Annotated[
     Sequence[Name | type[Tuner]],
     Expected("names of tuners or subclasses of Tuner, as ['cma_es', 'random']"),
 ]
-"""Who is compared."""
+"""The tuners to compare."""
 RecordingFile: TypeAlias = Annotated[
     str | Path, Expected("the path of NAME.csv, which results are traced to")
 ]
-"""A recording that must be in a file."""
+"""A recording that must be a file."""
 
 
 @check_arguments
@@ -111,41 +109,41 @@ def compare(
     """Run an experiment: every tuner on every target with every seed.
 
     Args:
-        experiment: the name of an experiment, the path of its TOML file, or an `Experiment`; None
-            for a robot, which `model` and `free` describe.
-        model: model file of a robot, MJCF or URDF.
-        recording: path of a recording of that robot; without one, targets are simulated.
-        free: numbers of the model file to tune, as ``damping@*`` or ``mass@forearm``.
-        tuners: labels, registered names or classes of the tuners to run; all of the experiment's
-            where None. A class is registered.
-        targets: number of targets in each range.
-        seeds: number of seeds for each tuner that uses random numbers.
-        budget: number of simulations on one target.
-        training_budget: number of simulations that a learned tuner may train on.
-        timeout: time limit of a run in seconds.
-        memory: memory limit of a run in MiB; 0 is no limit.
-        jobs: number of worker processes. 0 runs everything in this process: output of ``print``
+        experiment: Name of an experiment, path of its TOML file, or an `Experiment`; None for a
+            robot, which `model` and `free` describe.
+        model: Model file of a robot, MJCF or URDF.
+        recording: Path of a recording of that robot; without one, targets are simulated.
+        free: Numbers of the model file to tune, as ``damping@*`` or ``mass@forearm``.
+        tuners: Labels, registered names or classes of the tuners to run; None for all tuners of the
+            experiment. A class is registered.
+        targets: Number of targets in each range.
+        seeds: Number of seeds for each tuner that uses random numbers.
+        budget: Number of simulations on one target.
+        training_budget: Number of simulations that a learned tuner may train on.
+        timeout: Time limit of a run in seconds.
+        memory: Memory limit of a run in MiB; 0 is no limit.
+        jobs: Number of worker processes. 0 runs everything in this process: output of ``print``
             appears, breakpoints work, and classes of a script or notebook can be used; tuners are
-            trusted then.
-        trust: run tuners inside the harness, where they could read the true parameters. This is
+            then not isolated.
+        trust: Run tuners inside the harness, where they could read the true parameters. This is
             faster, and the results are marked.
         isolation: ``run`` starts a fresh process for every run of a tuner, ``tuner`` one for all
-            runs with the same seed; the experiment's own where None.
-        salt: text from which targets are drawn. It is secret until the end; ``public`` draws the
-            published targets; a fresh one where None.
-        out: folder to write, new or empty; a new one below results/ where None.
+            runs with the same seed; None for the experiment's own choice.
+        salt: Text from which targets are drawn. It is secret until the end; ``public`` draws the
+            published targets; None for a fresh one.
+        out: Folder to write, new or empty; None for a new one below results/.
         plugins: Python files with further tuners, simulators and effects.
-        cluster: address of a Dask scheduler to run on.
-        progress: called with a title and a number of steps; gives the function that is called after
-            each step.
-        force: start even if it needs more than this machine has.
-        pdf: write every figure as PDF too, in addition to PNG.
+        cluster: Address of a Dask scheduler to run on.
+        progress: Called with a title and a number of steps; returns the function that is called
+            after each step.
+        force: Start even if it needs more than this machine has.
+        pdf: Write every figure as PDF, too, in addition to PNG.
 
     Returns:
         Tables and figures of the results.
 
     Raises:
-        InputError: an argument, the experiment or a plugin cannot be used; nothing has been run
+        InputError: An argument, the experiment or a plugin cannot be used; nothing has been run
             then.
     """
     if experiment is None and not (model or recording or free):
@@ -190,25 +188,24 @@ def sweep(
     force: bool = False,
     pdf: bool = False,
 ) -> list[Compared]:
-    """Run every experiment that one with a ``[sweep]`` or ``experiments`` stands for, one by one.
+    """Run one by one the experiments of a ``[sweep]`` or of an ``experiments`` list.
 
     Args:
-        experiment: its name, the path of its TOML file, or itself.
-        jobs: as in `compare`.
-        trust: as in `compare`.
-        salt: as in `compare`; one for all that a sweep stands for, so that they meet the same
-            targets.
-        out: folder in which each gets its own, named as the experiment is.
-        plugins: as in `compare`.
-        progress: told of every step.
-        force: as in `compare`.
-        pdf: as in `compare`.
+        experiment: Name of an experiment, path of its TOML file, or an `Experiment`.
+        jobs: As in `compare`.
+        trust: As in `compare`.
+        salt: As in `compare`; all experiments share it, so that they have the same targets.
+        out: Folder in which each experiment gets its own folder, with the experiment's name.
+        plugins: As in `compare`.
+        progress: As in `compare`.
+        force: As in `compare`.
+        pdf: As in `compare`.
 
     Returns:
-        Their results, in the order of the file's values.
+        The results, in the order of the file's values.
 
     Raises:
-        InputError: a fault in what was asked for, in one line; nothing has been run then.
+        InputError: An argument is invalid; the message is one line, and nothing has been run then.
     """
     files = [str(Path(plugin).resolve()) for plugin in plugins]
     chosen = choose(given(experiment, files, trust or not jobs))
@@ -228,10 +225,16 @@ def wanted(
     recording: str | Path | None = None,
     free: Sequence[str] = (),
 ) -> str | Path | Experiment:
-    """The experiment that is named, or the one that a model file and a recording stand for.
+    """Return the named experiment, or the one described by a model file and a recording.
+
+    Args:
+        experiment: Name of an experiment, path of its TOML file, or an `Experiment`.
+        model: Model file of a robot.
+        recording: Recording of that robot.
+        free: Numbers of the model file to tune.
 
     Raises:
-        InputError: neither or both.
+        InputError: Neither or both are given.
     """
     parts = {"model": model, "recording": recording, "free": free}
     there = [name for name, value in parts.items() if value]
@@ -256,15 +259,21 @@ def given(
     trust: bool,
     isolation: str | None = None,
 ) -> Experiment:
-    """An experiment whose plugins are known to this process; see `compare`.
+    """Load an experiment and its plugins into this process.
+
+    Args:
+        experiment: Name of an experiment, path of its TOML file, or an `Experiment`.
+        plugins: Python files with further parts.
+        trust: Whether to run tuners without isolation.
+        isolation: As in `compare`.
 
     Raises:
-        InputError: no such experiment, or a plugin cannot be used.
+        InputError: The experiment does not exist, or a plugin cannot be used.
     """
     whole = experiment if isinstance(experiment, Experiment) else load(str(experiment))
     whole = whole.chosen(trusted=whole.trusted or trust, isolation=isolation)
     admit([str(Path(plugin).resolve()) for plugin in plugins], whole)
-    # Whatever is left to the robot's usual commands stands in the folder of results.
+    # The robot's default commands are filled in, so that the result folder contains them.
     return completed(whole)
 
 
@@ -277,19 +286,19 @@ def _cluster(address: str | None) -> Pool | None:
 
 
 def _made(begun: study.Study, jobs: int, progress: Progress | None, pool: Pool | None) -> Compared:
-    """The study, made and reported."""
+    """Run and report a study."""
     made = begun.make(jobs, progress, pool)
     if made.skipped:
         raise InputError(f"{begun.configuration.experiment.name}: skipped: {made.skipped}")
     begun.finish(_unsaid)
     if made.interrupted:
-        # In a notebook the cell ends as the person wished; what was finished is in the folder.
+        # A notebook's cell ends as the user requested; finished runs are stored in the folder.
         raise KeyboardInterrupt(f"what was finished is kept in {begun.folder}")
     return Compared(begun.folder)
 
 
 def _unsaid(_line: str) -> None:
-    """What the command prints; from Python the tables are at hand."""
+    """Discard a line that the command would print; in Python the tables are available."""
 
 
 def choose(
@@ -298,16 +307,16 @@ def choose(
     seeds: int | None = None,
     **changes: float | None,
 ) -> Experiment:
-    """An experiment with changes.
+    """Apply changes to an experiment.
 
     Args:
-        experiment: its name, the path of its TOML file, or itself.
-        labels: only these tuners, by label or registered name.
-        seeds: of each tuner that uses chance.
-        changes: other fields; None leaves one as it is.
+        experiment: Name of an experiment, path of its TOML file, or an `Experiment`.
+        labels: Labels or registered names of the only tuners to run; None for all.
+        seeds: Number of seeds for each tuner that uses random numbers.
+        changes: Other fields; None leaves a field unchanged.
 
     Raises:
-        InputError: no such experiment or tuner.
+        InputError: The experiment or a tuner does not exist.
     """
     whole = experiment if isinstance(experiment, Experiment) else load(str(experiment))
     if whole.diagnosis:
@@ -327,7 +336,7 @@ def choose(
 def _choose_diagnosers(
     whole: Experiment, labels: Sequence[str] | None, changes: Mapping[str, float | None]
 ) -> Experiment:
-    """A comparison of diagnosers with changes: its targets are questions."""
+    """Apply changes to a comparison of diagnosers, whose targets are benchmark cases."""
     sample = changes.get("targets")
     table = dict(whole.diagnosis)
     if sample is not None:
@@ -342,7 +351,7 @@ def _choose_diagnosers(
 
 
 def _label(tuner: str | type[Tuner]) -> str:
-    """The name under which a tuner runs; a class is registered."""
+    """Return the name under which a tuner runs; register a class."""
     if isinstance(tuner, str):
         return tuner
     if not (inspect.isclass(tuner) and issubclass(tuner, Tuner)):
@@ -351,18 +360,18 @@ def _label(tuner: str | type[Tuner]) -> str:
 
 
 class Compared:
-    """A comparison that has been made, read from its folder.
+    """A comparison that has been run, read from its folder.
 
     Args:
-        folder: of a comparison of tuners or of diagnosers, a bounce shot or a study of a missing
-            effect, finished or not.
+        folder: Folder of a comparison of tuners or of diagnosers, a bounce shot or a study of a
+            missing effect, finished or not.
 
     Attributes:
-        folder: where everything lies.
-        experiment: what was asked for.
+        folder: Folder with all results.
+        experiment: The experiment that was run.
 
     Raises:
-        InputError: the folder is not that of a comparison.
+        InputError: The folder is not that of a comparison.
     """
 
     @check_arguments
@@ -383,7 +392,7 @@ class Compared:
             problem.close()
 
     def _csv(self, name: str) -> pd.DataFrame:
-        """A table of a bounce shot or of a study of two comparisons, as it was written."""
+        """Read a table file of a bounce shot or of a study of two comparisons."""
         remedy = f"simgap plot {self.folder} writes it again"
         path = self.folder / f"{name}.csv"
         columns = (_OF_SHOTS if self.experiment.shot else _OF_TWO)[name]
@@ -392,19 +401,19 @@ class Compared:
 
     @property
     def _in_files(self) -> bool:
-        """Whether tables and figures are such as no comparison has."""
+        """Whether tables and figures are only available as files in the folder."""
         asked = self.experiment
         return bool(asked.shot or asked.calibration or asked.diagnosis)
 
     @property
     def _what(self) -> str:
-        """What such a folder is called."""
+        """Name of this kind of study, for messages."""
         if self.experiment.diagnosis:
             return "a comparison of diagnosers"
         return "a bounce shot" if self.experiment.shot else "a study of two comparisons"
 
     def _both(self, rows: Callable[[Stored], pd.DataFrame]) -> pd.DataFrame:
-        """Rows of both comparisons of a study of two, the simulator's name in front."""
+        """Concatenate rows of a study's two comparisons, with the simulator's name first."""
         import pandas as pd
 
         parts = []
@@ -416,10 +425,12 @@ class Compared:
 
     @cached_property
     def tables(self) -> dict[str, pd.DataFrame]:
-        """The tables by name: table, ert, ranking, pairs, break_even, who_wins; of a bounce shot
-        table and shots (docs/results-films.md), of a study of a missing effect table, ranks and
-        ranking (docs/misspecified.md), of a comparison of diagnosers table, failures, items and
-        the others (docs/diagnosers.md).
+        """Tables by name.
+
+        A comparison of tuners has table, ert, ranking, pairs, break_even and who_wins; a bounce
+        shot table and shots (docs/results-films.md); a study of a missing effect table, ranks and
+        ranking (docs/misspecified.md); a comparison of diagnosers table, failures, items and others
+        (docs/diagnosers.md).
         """
         if self.experiment.diagnosis:
             return {name: diagnosis.read_table(self.folder, name) for name in diagnosis.TABLES}
@@ -431,15 +442,17 @@ class Compared:
 
     @property
     def table(self) -> pd.DataFrame:
-        """Error after N simulations by tuner, range and metric, in long form, as table.csv; of
-        diagnosers each share with its interval.
+        """Error after N simulations by tuner, range and metric, in long form, as in table.csv.
+
+        For diagnosers, each share with its interval.
         """
         return self.tables["table"]
 
     @property
     def runs(self) -> pd.DataFrame:
-        """A row for each simulation, as runs.parquet; of a bounce shot a row for each shot, of
-        diagnosers for each answer.
+        """A row for each simulation, as in runs.parquet.
+
+        A bounce shot has a row for each shot, a comparison of diagnosers one for each answer.
         """
         if self.experiment.diagnosis:
             return self.tables["items"]
@@ -449,7 +462,7 @@ class Compared:
 
     @property
     def statuses(self) -> pd.DataFrame:
-        """A row for each run or answer, how it ended and why, as status.csv."""
+        """A row for each run or answer with its status and reason, as in status.csv."""
         if self.experiment.diagnosis:
             return self.tables["items"][list(diagnosis.STATUS)]
         if self.experiment.calibration:
@@ -458,21 +471,23 @@ class Compared:
 
     @property
     def figures(self) -> list[str]:
-        """Names of the figures that there are; those of a bounce shot, of a study of a missing
-        effect and of diagnosers are files in its folder.
+        """Names of the available figures.
+
+        The figures of a bounce shot, of a study of a missing effect and of diagnosers are files in
+        the folder instead.
         """
         return [] if self._in_files else comparison.names(self._stored)
 
     def figure(self, name: str = "error", behind: str | Sequence[str] = ()) -> Figure:
-        """One of the figures, made anew; a notebook shows it inline.
+        """Draw one of the figures; a notebook shows it inline.
 
         Args:
-            name: of the figure.
-            behind: reference results, or folders of comparisons, in grey behind it, as
-                ``ball-drop``; two at most.
+            name: Name of the figure.
+            behind: Reference results, such as ``ball-drop``, or folders of comparisons, which are
+                drawn in grey; at most two.
 
         Raises:
-            InputError: there is none of that name, or a reference cannot be drawn behind it.
+            InputError: There is no such figure, or a reference cannot be drawn in it.
         """
         if self._in_files:
             raise InputError(f"figures of {self._what} are files: {self.folder / 'figures'}")
@@ -481,8 +496,9 @@ class Compared:
         return comparison.figure(self._stored, self._labels, name, behind=references)
 
     def summary(self) -> pd.DataFrame:
-        """Return the last error of each tuner in the order of the ranking, with its verdict and the
-        number of failed runs; for diagnosers what each raises and names.
+        """Return each tuner's last error in ranking order, with verdict and failures.
+
+        For diagnosers, the measures of each diagnoser.
         """
         table = self.table
         if self.experiment.diagnosis:

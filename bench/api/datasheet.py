@@ -1,4 +1,4 @@
-"""`simgap.datasheet`."""
+"""Python API: `simgap.datasheet`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Explained: TypeAlias = Annotated[
     str | Path | Explanation,
     Expected("an Explanation (of explain), or the folder that it was written to"),
 ]
-"""What `explain` has found."""
+"""A result of `explain`."""
 
 
 @check_arguments
@@ -52,27 +52,27 @@ def datasheet(
     """Make the data sheet of a joint or actuator.
 
     Args:
-        recording: the logs, as for `explain`.
-        joint: which, of a robot of several.
-        name: on the sheet; None for the joint's or the system's.
-        explained: what `explain` has found in these logs, or the folder that it was written to;
-            None to explain them now.
-        system: as for `explain`, and so what follows.
-        model: see there.
-        units: see there.
-        constants: see there.
-        description: see there.
-        free: see there.
-        force: see there.
-        budget: see there.
-        jobs: see there.
-        say: see there.
-        stop: see there.
-        progress: see there.
+        recording: The logs, as for `explain`.
+        joint: Name of the joint, if the robot has several.
+        name: Name on the sheet; None for the name of the joint or system.
+        explained: Result of `explain` for these logs, or the folder to which it was written; None
+            to explain them now.
+        system: As for `explain`.
+        model: As for `explain`.
+        units: As for `explain`.
+        constants: As for `explain`.
+        description: As for `explain`.
+        free: As for `explain`.
+        force: As for `explain`.
+        budget: As for `explain`.
+        jobs: As for `explain`.
+        say: As for `explain`.
+        stop: As for `explain`.
+        progress: As for `explain`.
 
     Raises:
-        InputError: as `explain`; or there is no such joint, or the folder is not one that explain
-            has written, or of other logs.
+        InputError: As for `explain`; or there is no such joint, or the folder was not written by
+            explain, or belongs to other logs.
     """
     about = FrameDescription(system, model, units or {}, constants or {}, description or {})
     sources = sources_of(recording, about)
@@ -112,10 +112,17 @@ def refuse_joint(
     model: str | Path | None = None,
     free: Sequence[str] = (),
 ) -> None:
-    """Refuse a joint that the recording's robot does not have, before anything is explained.
+    """Reject a joint that the recording's robot does not have, before anything is explained.
+
+    Args:
+        recording: The logs, as for `explain`.
+        joint: Name of the joint; None if the robot has only one.
+        system: As for `explain`.
+        model: As for `explain`.
+        free: As for `explain`.
 
     Raises:
-        InputError: it has none of that name, or several and none is named.
+        InputError: There is no joint with this name, or there are several and none is named.
     """
     loaded, kind = load_all(sources_of(recording), system, model, free)
     if not issubclass(kind, Simulated):
@@ -124,10 +131,10 @@ def refuse_joint(
 
 
 def _sound(verdict: Verdict) -> Verdict:
-    """A verdict whose parts that are used here are what they should be.
+    """Check the types of those parts of a verdict that are used here, and return it.
 
     Raises:
-        ValueError: one is not.
+        ValueError: A part is invalid.
     """
     texts: list[object] = [verdict.verdict]
     numbers: list[object] = []
@@ -145,7 +152,7 @@ def _sound(verdict: Verdict) -> Verdict:
 
 
 def _read(folder: Path) -> tuple[Extended, Verdict]:
-    """What explain has written to a folder."""
+    """Read the results that explain has written to a folder."""
     path = folder / "verdict.json"
     try:
         verdict = _sound(Verdict.of(json.loads(path.read_text(encoding="utf-8"))))

@@ -1,4 +1,4 @@
-"""`simgap.design`."""
+"""Python API: `simgap.design`."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from sims.base import InputError
 from sims.recording.write import publish, refuse_existing
 
 LONGEST = 600.0
-"""Seconds of a run that is designed."""
+"""Maximum duration of a designed run, in seconds."""
 
 
 LONGER = 5.0
-"""Times as long as it is to last, a run may last where that settles something."""
+"""Maximum ratio of a run's duration to the requested one, if that settles a question."""
 REPEATS = 8
-"""Times that anybody would record one run."""
+"""Maximum number of repetitions of a run that is recommended."""
 
 
 @dataclass(frozen=True)
 class NextRecording:
-    """What to record next.
+    """Recommendation for the next recording.
 
     Attributes:
-        explanation: of what there is so far.
-        design: the run; None where none can be simulated that stays within its limits.
+        explanation: Explanation of the existing recordings.
+        design: The run to record; None if no run within the limits can be simulated.
     """
 
     explanation: Explanation
     design: Design | None
 
     def lines(self) -> list[str]:
-        """What to record, and what it would bring, in words."""
+        """Format the recommended run and its expected benefit as text."""
         found = self.design
         if found is None:
             return ["no run could be simulated that stays within the limits of what moves"]
@@ -61,11 +61,16 @@ class NextRecording:
 
     @check_arguments
     def write(self, path: str | Path) -> None:
-        """Write the commands: ``t`` in s and a column for each input, in the SI units of
-        `simgap list systems`, held from row to row.
+        """Write the commands as CSV.
+
+        The columns are ``t`` in s and one for each input in the SI units of `simgap list systems`;
+        values are held from row to row.
+
+        Args:
+            path: Path of a new file.
 
         Raises:
-            InputError: there is no run, or the file is there already.
+            InputError: There is no run, or the file exists already.
         """
         if self.design is None:
             raise InputError("there is no run to write")
@@ -78,7 +83,7 @@ class NextRecording:
 
 
 def _told(found: Design) -> list[str]:
-    """What a run tells apart, and what it does not."""
+    """Format which causes a run distinguishes, and which it does not."""
     lines = []
     if found.split:
         sizes = [f"{name} ({math.sqrt(found.told[name]):.3g})" for name in found.split]
@@ -117,28 +122,30 @@ def design(
     progress: Callable[[float, str], None] | None = None,
     listener: ProgressListener | None = None,
 ) -> NextRecording:
-    """Design the next recording: commands that split causes which these runs cannot tell apart, or
-    that narrow the numbers that stand; within the limits of joints and commands, by simulation.
+    """Design the next recording by simulation, within the limits of joints and commands.
+
+    The commands distinguish causes that the existing runs cannot tell apart, or reduce the
+    uncertainty of the estimated numbers.
 
     Args:
-        recording: what there is so far, as for `explain`.
-        seconds: how long the next run is to last.
-        longest: how long it may last where that many seconds do not settle what is open; five times
-            as long where it is not given.
-        system: as for `explain`.
-        model: as for `explain`.
-        units: as for `explain`.
-        constants: as for `explain`.
-        description: as for `explain`.
-        free: as for `explain`.
-        jobs: as for `explain`.
-        say: as for `explain`.
-        stop: as for `explain`.
-        progress: as for `explain`.
-        listener: as for `explain`.
+        recording: The existing recordings, as for `explain`.
+        seconds: Duration of the next run in seconds.
+        longest: Maximum duration in seconds, if `seconds` does not settle the open questions; None
+            for five times `seconds`.
+        system: As for `explain`.
+        model: As for `explain`.
+        units: As for `explain`.
+        constants: As for `explain`.
+        description: As for `explain`.
+        free: As for `explain`.
+        jobs: As for `explain`.
+        say: As for `explain`.
+        stop: As for `explain`.
+        progress: As for `explain`.
+        listener: As for `explain`.
 
     Raises:
-        InputError: as `explain`, or the seconds are no number above 0.
+        InputError: As for `explain`, or a duration is out of range.
     """
     if not 0 < seconds <= LONGEST:
         raise InputError(f"seconds: expected 0 to {LONGEST:g}, found {seconds!r}")

@@ -1,4 +1,4 @@
-"""`simgap.explain` and `simgap.score`."""
+"""Python API: `simgap.explain` and `simgap.score`."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _RECORDING = (
 Source: TypeAlias = Annotated[
     str | Path | Recording | SimulatedRecording | Frame, Expected(_RECORDING)
 ]
-"""What holds a recording."""
+"""A source of one recording."""
 Sources: TypeAlias = Annotated[
     Source | Sequence[Source], Expected(f"{_RECORDING}, or a list of these")
 ]
-"""What holds one recording, or several."""
+"""A source of one recording, or several."""
 Units: TypeAlias = Annotated[
     Mapping[str, str], Expected("units of columns by their names, as {'q': 'rad'}")
 ]
-"""Of the columns of a data frame, by name."""
+"""Units of a data frame's columns, by column name."""
 
 
 @check_arguments
@@ -63,44 +63,44 @@ def explain(
     progress: Callable[[float, str], None] | None = None,
     listener: ProgressListener | None = None,
 ) -> Explanation:
-    """Find what the simulator of a recorded system lacks, and extend the simulator by it.
+    """Find the effects that a simulator of a recorded system lacks, and add them to it.
 
     Args:
-        recording: the path of ``NAME.csv``, a recording that was read or simulated, or a pandas
+        recording: Path of ``NAME.csv``, a recording that was read or simulated, or a pandas
             DataFrame with the columns that `read_recording` describes. Several recordings of one
-            system are explained together, and each also by itself.
-        system: name of the system, in place of the one that the description states. A DataFrame
+            system are explained together, and each also separately.
+        system: Name of the system, instead of the one that the description states. A DataFrame
             needs this or `model`.
-        model: model file of a robot, MJCF or URDF, in place of what the description states.
-        units: units of a DataFrame's columns by name; those in ``df.attrs["units"]`` without.
-        constants: known numbers of the system in SI units, with a DataFrame.
-        description: anything else about a DataFrame, with the keys of ``NAME.toml``.
+        model: Model file of a robot, MJCF or URDF, instead of the one that the description states.
+        units: Units of a DataFrame's columns by name; None for those in ``df.attrs["units"]``.
+        constants: Known numbers of the system in SI units, with a DataFrame.
+        description: Any other entries about a DataFrame, with the keys of ``NAME.toml``.
         engine: ``pybullet``, ``mujoco`` or ``batch``; not used for a simulator that steps itself.
-        free: constants to estimate together with the parameters; for a robot, numbers of its model
+        free: Constants to estimate together with the parameters; for a robot, numbers of its model
             file, as ``damping@*`` or ``mass@forearm``.
-        tuner: name of a tuner that finds the starting point of the base fit; a grid where None.
-        seed: seed of the surrogate data and the bootstrap.
-        force: explain a recording that needs more than this machine has, or whose stamps cannot be
+        tuner: Name of a tuner that finds the starting point of the base fit; None for a grid.
+        seed: Seed of the surrogate data and the bootstrap.
+        force: Explain a recording that needs more than this machine has, or whose stamps cannot be
             seconds.
-        budget: time limit of the search in seconds. The search then ends with what it has found,
-            and ``cut`` of the answer says what was not tested. No limit where None.
-        jobs: number of processes; one for each core where None. The answer does not depend on it.
-        whole: use all samples of a long recording of a robot; otherwise pieces from all over it.
-        pieces: length in seconds of the pieces that runs are cut into. Each piece has an initial
-            state of its own, for motion that drifts or is unstable.
-        thorough: where causes are found and a residual remains, search for further causes that
+        budget: Time limit of the search in seconds; None for no limit. At the limit the search ends
+            with its results so far, and ``cut`` of the answer says what was not tested.
+        jobs: Number of processes; None for one per core. The answer does not depend on it.
+        whole: Use all samples of a long recording of a robot; otherwise segments from all over it.
+        pieces: Length in seconds of the segments that runs are cut into. Each segment has its own
+            initial state, for motion that drifts or is unstable.
+        thorough: If causes are found and a residual remains, search for further causes that
             held-out runs confirm. This takes about twice as long.
-        say: called with notes on the recording and the base model.
-        stop: called between two steps; the search ends, as at its time limit, when it returns True.
-        progress: called with the share that is done (an estimate) and the current step.
-        listener: receives the events of the search: its stages with their steps, and the best
-            model so far.
+        say: Called with notes on the recording and the base model.
+        stop: Called between two steps; if it returns True, the search ends as at its time limit.
+        progress: Called with the share that is done (an estimate) and the current step.
+        listener: Receives the events of the search: its stages with their steps, and the best model
+            so far.
 
     Returns:
         The verdict, its causes, the extended simulator and the figures.
 
     Raises:
-        InputError: an argument is wrong; the recording cannot be read, is too short or is of a
+        InputError: An argument is wrong; the recording cannot be read, is too short or is of a
             simulator that takes no effects; or the search ended before the first simulation.
     """
     about = FrameDescription(system, model, units or {}, constants or {}, description or {})
@@ -114,15 +114,15 @@ def explain(
 def sources_of(
     recording: Source | Sequence[Source], about: FrameDescription | None = None
 ) -> list[str | Path | Recording]:
-    """One or several recordings, each as a path or as a recording in memory.
+    """Return recordings as a list of paths and of recordings in memory.
 
     Args:
-        recording: one, or several.
-        about: what the user states of data frames among them.
+        recording: One recording, or several.
+        about: Description of data frames among them.
 
     Raises:
-        InputError: no recording is given, a data frame is malformed, or `about` describes what is
-            no data frame.
+        InputError: No recording is given, a data frame is malformed, or `about` describes
+            recordings that are not data frames.
     """
     about = about or FrameDescription()
     single = isinstance(recording, str | Path | Recording | SimulatedRecording | Frame)
@@ -153,23 +153,24 @@ def score(
     held_out: bool = False,
     force: bool = False,
 ) -> dict[str, Any]:
-    """The error of an extended simulator on another recording; initial states are estimated there,
-    nothing else.
+    """Compute the error of an extended simulator on another recording.
+
+    Only the initial states are estimated there.
 
     Args:
-        model: extended.toml, or a robot's model file, as extended.xml.
-        recording: as in `explain`; a DataFrame is of the model's system.
-        units: as in `explain`.
-        constants: as in `explain`.
-        description: as in `explain`.
-        held_out: count only runs that are marked so.
-        force: as in `explain`.
+        model: Path of extended.toml, or of a robot's model file, such as extended.xml.
+        recording: As for `explain`; a DataFrame is of the model's system.
+        units: As for `explain`.
+        constants: As for `explain`.
+        description: As for `explain`.
+        held_out: Whether to use only runs that are marked as held out.
+        force: As for `explain`.
 
     Returns:
         rmse by channel in its unit, normalised_rmse in units of the noise, runs, samples, units.
 
     Raises:
-        InputError: a file cannot be read, or the recording is of another system.
+        InputError: A file cannot be read, or the recording is of another system.
     """
     about = FrameDescription(None, None, units or {}, constants or {}, description or {})
     if isinstance(recording, Frame):
@@ -179,7 +180,7 @@ def score(
 
 
 def _of_model(model: Path, about: FrameDescription) -> FrameDescription:
-    """What is stated of a data frame, of the system or robot that a model is of."""
+    """Complete the description of a data frame by the system or robot of a model."""
     if model.suffix in MODEL_FILES:
         return replace(about, model=model)
     extended = extended_file.read(model)

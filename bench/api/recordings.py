@@ -1,4 +1,4 @@
-"""`simgap.simulate`, `simgap.read_recording` and `simgap.import_logs`."""
+"""Python API: `simgap.simulate`, `simgap.read_recording` and `simgap.import_logs`."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ Effects: TypeAlias = Annotated[
     Mapping[str, Coefficients],
     Expected("coefficients by the names of effects, as {'drag.linear': 2e-4}"),
 ]
-"""Effects that act."""
+"""Active effects with their coefficients, by name."""
 InputSignal: TypeAlias = Annotated[
     float | str, Expected("a number or the text of a signal, as 'sine:2:0.5'")
 ]
-"""What is put in."""
+"""Value of an input over time."""
 InitialState: TypeAlias = Annotated[
     float | tuple[float, float], Expected("a number or (low, high)")
 ]
-"""Where each run begins, or the range from which it is drawn."""
+"""Initial state of each run, or the range from which it is drawn."""
 Logs: TypeAlias = Annotated[
     str | Path | Sequence[str | Path], Expected("the path of a log, or a list of paths")
 ]
-"""Files of one run, or folders that each hold those of one."""
+"""Files of one run, or folders with the files of one run each."""
 
 
 @check_arguments
@@ -57,29 +57,30 @@ def simulate(
     held_out: int | None = None,
     force: bool = False,
 ) -> SimulatedRecording:
-    """Simulate a recording whose truth is known; nothing is written before `write` is called.
+    """Simulate a recording with known truth; nothing is written before `write` is called.
 
     Args:
-        system: registered name of a simulator, e.g. ``pendulum``; empty where there is a model.
-        model: a robot's model file, MJCF or URDF.
-        actuators: that the model file lacks, by name, as in a recording's ``[actuators.NAME]``.
-        parameters: other than their nominal values, by name; or all of them in order.
-        effects: that act, with a coefficient, several in order, or some by name.
-        constants: other than the system's defaults.
-        noise: sensor noise, 1 sigma, of every channel or by channel.
-        inputs: by name, a constant or the text of a signal, as ``sine:2:0.5``.
-        initial: initial states by name, a value or (low, high) from which each run draws.
-        observe: channels to record; the system's usual ones where empty.
-        runs: number of runs.
-        seconds: length of a run.
-        rate: samples a second.
+        system: Registered name of a simulator, e.g. ``pendulum``; empty if a model is given.
+        model: A robot's model file, MJCF or URDF.
+        actuators: Actuators that the model file lacks, by name, as in a recording's
+            ``[actuators.NAME]``.
+        parameters: Parameters that differ from their nominal values, by name; or all in order.
+        effects: Active effects with one coefficient, several in order, or some by name.
+        constants: Constants that differ from the system's defaults.
+        noise: Sensor noise, 1 sigma, of every channel or by channel.
+        inputs: By name, a constant or the text of a signal, such as ``sine:2:0.5``.
+        initial: Initial states by name, a value or (low, high) for a uniform draw in each run.
+        observe: Channels to record; empty for the system's default channels.
+        runs: Number of runs.
+        seconds: Length of a run in seconds.
+        rate: Samples per second.
         engine: pybullet, mujoco or batch.
-        seed: of all that is drawn.
-        held_out: how many of the last runs are marked as held out; a third where None.
-        force: make it although it needs more than this machine has.
+        seed: Seed of all random numbers.
+        held_out: Number of final runs that are marked as held out; None for a third of them.
+        force: Simulate although it needs more resources than this machine has.
 
     Raises:
-        InputError: something that cannot be, in one line.
+        InputError: An argument is invalid; the message is one line.
     """
     return make(
         Wish(
@@ -114,23 +115,23 @@ def read_recording(
     constants: Mapping[str, float] | None = None,
     description: Mapping[str, Any] | None = None,
 ) -> Recording:
-    """Read and check ``NAME.csv`` with ``NAME.toml`` beside it, or a pandas DataFrame.
+    """Read and check ``NAME.csv`` with ``NAME.toml`` in the same folder, or a pandas DataFrame.
 
     The columns of a DataFrame are those of ``NAME.csv``: ``run`` (not needed for a single run),
     ``t`` in seconds, and channels and inputs under their names in the system; a missing sample is
     NaN. ``run`` and ``t`` may be levels of its index.
 
     Args:
-        path: the table, or a DataFrame.
-        system: name of the system, in place of the one that the description states. A DataFrame
+        path: Path of the table, or a DataFrame.
+        system: Name of the system, instead of the one that the description states. A DataFrame
             needs this or `model`.
-        model: model file of a robot, MJCF or URDF, in place of what the description states.
-        units: of a DataFrame's columns by name; those in ``df.attrs["units"]`` without.
-        constants: known numbers of the system in SI units, with a DataFrame.
-        description: anything else about a DataFrame, with the keys of ``NAME.toml``.
+        model: Model file of a robot, MJCF or URDF, instead of the one that the description states.
+        units: Units of a DataFrame's columns by name; None for those in ``df.attrs["units"]``.
+        constants: Known numbers of the system in SI units, with a DataFrame.
+        description: Any other entries about a DataFrame, with the keys of ``NAME.toml``.
 
     Raises:
-        InputError: anything malformed, in one line.
+        InputError: The recording is malformed; the message is one line.
     """
     about = FrameDescription(system, model, units or {}, constants or {}, description or {})
     (source,) = sources_of(path, about)
@@ -148,24 +149,25 @@ def import_logs(
     position_unit: Name = "",
     calibration: str | Path | None = None,
 ) -> Imported:
-    """Describe a robot's logs as they lie: write the toml by which every command reads them.
+    """Write a description (TOML) of a robot's raw logs, so that all commands can read them.
 
     Args:
-        logs: files of one run, or folders that each hold those of one.
-        model: what they are of, MJCF or URDF.
-        out: NAME.toml, a new file.
-        held_out: runs that no fit is to see; every third one without.
-        rate: of the rows, Hz, where the logs have no stamps.
-        position_unit: of positions and their commands that state none: ``rad``, ``deg``, or
-            ``normalised`` (-100 to 100 of LeRobot); told from the joints' ranges without.
-        calibration: calibration file of LeRobot, by which normalised positions become angles.
+        logs: Files of one run, or folders with the files of one run each.
+        model: Model file of the robot, MJCF or URDF.
+        out: Path NAME.toml of a new file.
+        held_out: Names of held-out runs; every third one if empty.
+        rate: Rate of the rows in Hz, if the logs have no time stamps.
+        position_unit: Unit of positions and their commands for which none is stated: ``rad``,
+            ``deg``, or ``normalised`` (-100 to 100 of LeRobot); empty to derive it from the joints'
+            ranges.
+        calibration: Calibration file of LeRobot, by which normalised positions become angles.
 
     Returns:
-        What was guessed, what could not be told, and what to check.
+        The guesses, the columns that were left out, and what to check.
 
     Raises:
-        InputError: the logs cannot be read or nothing in them is the robot's, in one line; then
-            nothing is written.
+        InputError: The logs cannot be read or contain nothing of the robot; the message is one
+            line, and nothing is written.
     """
     given = [logs] if isinstance(logs, str | Path) else list(logs)
     path = Path(out)

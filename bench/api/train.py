@@ -1,4 +1,4 @@
-"""Trains a learned tuner ahead, into the cache that comparisons use, and keeps the losses."""
+"""Train a learned tuner ahead into the cache that comparisons use, and record its losses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from sims.base import InputError
 HEAD = ("seed", "stage", "epoch", "training_loss", "held_out_loss")
 """Columns of loss.csv."""
 _HELD_OUT = 160
-"""Simulations that the held-out loss is measured with, apart from the training budget."""
+"""Number of simulations for the held-out loss, in addition to the training budget."""
 
 
 def choose(
@@ -37,24 +37,25 @@ def choose(
     plugins: Sequence[str | Path] = (),
     trust: bool = False,
 ) -> tuple[Experiment, Entry]:
-    """The experiment and the entry to train.
+    """Select the experiment and the tuner to train.
 
     Args:
-        tuner: registered name, or the experiment's label.
-        simulator: registered name; or the name of an experiment, whose simulator is then meant.
-        experiment: name or TOML file; where None, the project's default experiment of the
-            simulator (`default_experiment`).
-        budget: simulations to learn from; the experiment's where None.
-        plugins: plugin files that they need.
-        trust: train it inside the harness, for comparisons that do likewise.
+        tuner: Registered name of a tuner, or its label in the experiment.
+        simulator: Registered name of a simulator; or the name of an experiment, to use its
+            simulator.
+        experiment: Name or TOML file of an experiment; None for the project's default experiment of
+            the simulator (`default_experiment`).
+        budget: Number of training simulations; None for the experiment's.
+        plugins: Plugin files that they need.
+        trust: Train the tuner inside the harness, for comparisons that do likewise.
 
     Raises:
-        InputError: they do not go together, or the tuner does not learn.
+        InputError: The arguments do not fit together, or the tuner does not learn.
     """
     if experiment is None and simulator in set(names()) - set(simulators.names()):
         experiment = simulator
         simulator = load(experiment).simulator
-    # A robot's simulator is registered nowhere: its experiment alone knows it.
+    # A robot's simulator is not registered; it is defined by its experiment.
     robotic = experiment is not None and load(experiment).model
     if not plugins and not robotic:
         simulators.get(simulator)
@@ -80,10 +81,17 @@ def choose(
 def taught(
     experiment: Experiment, entry: Entry, seed: int, watch: Watch | None, again: bool
 ) -> Training:
-    """Train, or find trained; see `bench.runs.training.train`.
+    """Train a tuner, or load its earlier training; see `bench.runs.training.train`.
+
+    Args:
+        experiment: Experiment in whose settings it is trained.
+        entry: Tuner to train.
+        seed: Seed of the training.
+        watch: Callback that observes the training.
+        again: Whether to train even if there is an earlier training.
 
     Raises:
-        TooFewError: the training budget does not last.
+        TooFewError: The training budget is too small.
     """
     lesson = Lesson(entry, seed)
     if not experiment.trusted:
@@ -91,7 +99,7 @@ def taught(
     try:
         return train(experiment, lesson, watch, again)
     except EndedError as ended:
-        # Of what went wrong in the tuner's process its name has come here, and its words.
+        # The error from the isolated process arrives as text: its name and its message.
         name, _, said = "".join(ended.reason.strip().splitlines()[-1:]).partition(": ")
         if name.endswith(TooFewError.__name__):
             raise TooFewError(said) from None
@@ -104,19 +112,17 @@ DEFAULT_EXPERIMENTS: Mapping[str, str] = {
     "pendulum": "pendulum-swing",
     "servo": "servo-step",
 }
-"""By simulator the experiment in whose settings `simgap train` trains, where several of the project
-tune it.
-"""
+"""Experiment in whose settings `simgap train` trains, by simulator with several experiments."""
 
 
 def default_experiment(simulator: str) -> str:
     """Return the name of the experiment in whose settings a simulator's tuners are trained.
 
-    It is the default of `DEFAULT_EXPERIMENTS`, else the only experiment of the project that tunes
-    the simulator. Studies of a missing effect, which compare simulators too, do not count.
+    It is the entry of `DEFAULT_EXPERIMENTS`, else the only experiment of the project that tunes the
+    simulator. Studies of a missing effect, which compare simulators, too, do not count.
 
     Raises:
-        InputError: no experiment trains this simulator, or several do and none is the default.
+        InputError: No experiment tunes this simulator, or several do and none is the default.
     """
     if simulator in DEFAULT_EXPERIMENTS:
         return DEFAULT_EXPERIMENTS[simulator]
@@ -132,12 +138,13 @@ def default_experiment(simulator: str) -> str:
 
 @dataclass
 class Losses:
-    """Looks on while a tuner trains, and keeps the losses; see `methods.base.Watch`.
+    """Training callback that records the losses; see `methods.base.Watch`.
 
     Attributes:
-        experiment: in which it trains.
-        start: begins to show the progress of a stage: title, steps; gives what advances it.
-        rows: as `HEAD`.
+        experiment: Experiment in whose settings the tuner is trained.
+        start: Starts a progress bar with a title and a number of steps; returns the function that
+            advances it.
+        rows: Rows of loss.csv, see `HEAD`.
     """
 
     experiment: Experiment
@@ -148,16 +155,24 @@ class Losses:
         self.begin("", 0)
 
     def begin(self, title: str, seed: int) -> None:
-        """What is trained from now on."""
+        """Set the title and seed of the next training."""
         self._title, self._seed, self._stage = title, seed, ""
 
     @property
     def ground(self) -> Practice:
-        """Simulations that only measure."""
+        """Counted simulator for evaluating the held-out loss."""
         return Problem(self.experiment).practice(_HELD_OUT)
 
     def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
-        """Note one pass over the data."""
+        """Record one pass over the training data.
+
+        Args:
+            stage: Name of the training stage.
+            epoch: Number of the pass.
+            epochs: Number of passes in the stage.
+            loss: Training loss.
+            held_out: Held-out loss.
+        """
         if stage != self._stage:
             self._stage = stage
             self._step = self.start(f"{self._title}, {stage}", epochs)
@@ -165,10 +180,17 @@ class Losses:
         self._step()
 
     def write(self, folder: Path, title: str) -> list[Path]:
-        """Write the losses as a table and a figure; returns what was written.
+        """Write the losses as a table and a figure.
+
+        Args:
+            folder: Folder to write; made if missing.
+            title: Title of the figure.
+
+        Returns:
+            Paths of the written files.
 
         Raises:
-            InputError: the folder cannot be made.
+            InputError: The folder cannot be made.
         """
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -78,8 +78,7 @@ def _channels(what: str, channels: list[Document]) -> list[str]:
 
 
 def _effect(each: Document) -> list[str]:
-    """Format an effect, with unit and plausible range of each coefficient on each kind of system.
-    """
+    """Format an effect, with its coefficients' units and plausible ranges by kind of system."""
     if each["skipped"]:
         return [f"{each['name']}: {_says(each)}"]
     result = [f"{each['name']} ({each['hook']}): {each['says']}"]

@@ -17,7 +17,7 @@ _ALL = "all"
 
 
 def add_download(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap download`."""
+    """Add the options of `simgap download`."""
     parser.add_argument(
         "names",
         metavar="NAME",

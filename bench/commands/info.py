@@ -67,8 +67,7 @@ def _data_sets() -> Path:
 
 
 def _revision() -> str | None:
-    """Return the commit of a checkout, with + if files were changed; None for an installed wheel.
-    """
+    """Return the commit of a checkout, with + if files were changed; None for a wheel."""
     import subprocess
 
     if not (_HOME / ".git").exists():

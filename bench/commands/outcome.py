@@ -28,8 +28,7 @@ def outcome(study: Study) -> Document:
 
 
 def files(folder: Path) -> list[Path]:
-    """List the files of a result folder and its figures, without journals of single runs or shots.
-    """
+    """List the files of a result folder and its figures, without the data of single runs."""
     inside = [*folder.glob("*"), *(folder / _DRAWN).glob("*")]
     return sorted(path for path in inside if path.is_file() and not path.name.startswith("."))
 

@@ -16,8 +16,7 @@ from sims.robot.system import RobotSystem
 
 
 def lines(model: Path) -> Iterator[str]:
-    """Yield lines about the places and signals of a model file, and the effects by kind of place.
-    """
+    """Yield lines about a model file's places and signals, and the effects that can act there."""
     kind = cast(type[RobotSimulator], robot(model))
     yield from about(kind)
     yield from _joints(kind.robot)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def add_simulate(simulate: argparse.ArgumentParser) -> None:
-    """The options of `simgap simulate`."""
+    """Add the options of `simgap simulate`."""
     simulate.add_argument(
         "system", metavar="SYSTEM", nargs="?", default="", help="see `simgap list systems`"
     )
@@ -80,7 +80,7 @@ def add_simulate(simulate: argparse.ArgumentParser) -> None:
 
 
 def add_inspect(inspect: argparse.ArgumentParser) -> None:
-    """The options of `simgap inspect`."""
+    """Add the options of `simgap inspect`."""
     inspect.add_argument(
         "recording", metavar="FILE.csv", type=place, help="the table; its .toml stands beside it"
     )
@@ -227,11 +227,12 @@ def _inspect(options: argparse.Namespace, say: Say) -> Answer:
 def _differing_conventions(
     options: argparse.Namespace, recording: Recording, kind: type[Simulator]
 ) -> tuple[list[ConventionDifference], list[str]]:
-    """Return the conventions of a robot's log that differ from those of its model file, and the
-    keys of the description that correct them.
+    """Return a robot log's conventions that differ from its model file, and their corrections.
+
+    The corrections are lines of keys of the description.
 
     Raises:
-        InputError: a corrected description is asked for, and nothing differs.
+        InputError: A corrected description is requested, but nothing differs.
     """
     from sims.base import InputError
     from sims.simulated import Simulated
@@ -257,7 +258,7 @@ def _differing_conventions(
 
 
 def _checked(options: argparse.Namespace, say: Say) -> list[Document]:
-    """Say what the recording can fix, number by number."""
+    """Print the identifiability of every number, before any fit."""
     from bench.gap.check import check
     from bench.gap.identify import told
 

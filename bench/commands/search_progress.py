@@ -1,4 +1,4 @@
-"""The display of a search's progress on stderr: one live line on a terminal, few lines in a log."""
+"""Show a search's progress on stderr: one live line on a terminal, few lines in a log."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 TERMINAL_INTERVAL = 0.2
-"""Shortest time between two updates of the live line, in seconds."""
+"""Minimum time between two updates of the live line, in seconds."""
 LOG_INTERVAL = 10.0
-"""Shortest time between two lines where stderr is not a terminal, in seconds."""
+"""Minimum time between two lines if stderr is not a terminal, in seconds."""
 TICK = 0.5
-"""Interval of the timer that keeps the display moving between two events, in seconds."""
+"""Interval of the timer that updates the display between two events, in seconds."""
 HINT_AFTER = 20.0
 """Elapsed time after which `HINT` is printed, in seconds."""
 HINT = "add --budget 60 to stop after a minute with the best answer so far"
 LEAST_SHARE = 0.02
-"""Share of the search that must be done before the remaining time is estimated."""
+"""Minimum share of the search that must be done before the remaining time is estimated."""
 OVERDUE = 0.5
-"""The estimated remaining time is at least this share of the time since the last event."""
+"""Minimum ratio of the estimated remaining time to the time since the last event."""
 BAR_WIDTH = 10
 """Width of the bar, in characters."""
 
 
 class SearchProgress:
-    """The state of a running search: a `ProgressListener` that keeps the latest events.
+    """The state of a running search: a `ProgressListener` that stores the latest events.
 
     Args:
-        clock: returns the time in seconds.
-        budget: seconds after which the search ends; None without such a limit.
+        clock: Returns the time in seconds.
+        budget: Seconds after which the search ends; None without such a limit.
     """
 
     def __init__(
@@ -49,7 +49,8 @@ class SearchProgress:
         self._best: tuple[str, str] | None = None
         self._share = 0.0
         self._is_searching = True
-        # The remaining time as it was estimated when the share last grew, and when that was.
+        # The remaining time as estimated when the share last increased, and the time of that
+        # estimate.
         self._estimate: float | None = None
         self._estimated_at = self._started
 
@@ -62,8 +63,8 @@ class SearchProgress:
         self._done += count
 
     def found(self, effects: Sequence[str], share: float) -> None:
-        """Keep the best model so far; see `ProgressListener`."""
-        # 99.96 % is not all of the gap.
+        """Store the best model so far; see `ProgressListener`."""
+        # 99.96 % must not be shown as 100 %.
         percent = "over 99" if 0.99 < share < 1.0 else f"{100.0 * share:.0f}"
         self._best = " + ".join(effects), percent
 
@@ -82,10 +83,10 @@ class SearchProgress:
         return self._clock() - self._started
 
     def remaining(self) -> float | None:
-        """Return the estimated remaining seconds; None where nothing is known or nothing remains.
+        """Return the estimated remaining seconds; None if unknown or if the search has ended.
 
-        The estimate assumes the mean pace so far. Between two events it counts down; where the next
-        event is overdue it grows with the time since the last one.
+        The estimate assumes the mean speed so far. Between two events it counts down; if the next
+        event is overdue, it grows with the time since the last one.
         """
         if self._estimate is None or not self._is_searching:
             return None
@@ -93,7 +94,7 @@ class SearchProgress:
         return max(self._estimate - since, OVERDUE * since)
 
     def finish(self, name: str) -> None:
-        """End the search and begin a stage that follows it, as drawing figures."""
+        """End the search and begin a stage that follows it, such as drawing figures."""
         self._is_searching = False
         self.stage(name)
 
@@ -101,14 +102,14 @@ class SearchProgress:
         """Yield the state as one line, in forms that need fewer and fewer columns.
 
         Args:
-            empty: a character of the bar that is not done; without it no bar is drawn.
-            full: a character of the bar that is done.
+            empty: Character of the bar for the part that is not done; empty for no bar.
+            full: Character of the bar for the part that is done.
         """
-        # Rounded down: a full bar means that all is done.
+        # Rounded down: a full bar means that everything is done.
         done = int(BAR_WIDTH * self._share)
         percent, bar = f"{100 * self._share:3.0f}% ", ""
         if not self._is_searching:
-            # The share is one of the search, which may have ended early.
+            # The share refers to the search, which may have ended early.
             percent = ""
         elif empty:
             bar = f"|{full * done}{empty * (BAR_WIDTH - done)}| "
@@ -159,19 +160,19 @@ def clock_text(seconds: float) -> str:
 
 
 class ProgressDisplay(SearchProgress):
-    """Shows a search's progress on stderr while it is entered.
+    """Context that shows a search's progress on stderr.
 
     On a terminal it keeps one live line, which it erases at the end. Elsewhere it prints a line at
-    most every `LOG_INTERVAL` seconds. Events only store values and look at the clock, so that the
-    search is not slowed down. A timer signal redraws between events, not a thread: a process with
-    threads cannot fork workers.
+    most every `LOG_INTERVAL` seconds. Events only store values and read the clock, so that the
+    search is not slowed down. A timer signal redraws between events instead of a thread, because a
+    process with threads cannot fork workers safely.
 
     Args:
-        budget: seconds after which the search ends; None without such a limit.
-        silent: show nothing.
-        hint: whether to print `HINT` in a long search without a budget.
-        stream: where to; stderr if None.
-        clock: returns the time in seconds.
+        budget: Seconds after which the search ends; None without such a limit.
+        silent: Whether to show nothing.
+        hint: Whether to print `HINT` in a long search without a budget.
+        stream: Output stream; stderr if None.
+        clock: Returns the time in seconds.
     """
 
     def __init__(
@@ -191,7 +192,7 @@ class ProgressDisplay(SearchProgress):
         self._interval = TERMINAL_INTERVAL if self._live else LOG_INTERVAL
         self._shown_at: float | None = None
         self._shown = ""
-        # A signal may arrive while a line is written. Its own output waits until that is done.
+        # A signal may arrive while a line is written; its own output waits until that is done.
         self._busy = False
         self._waiting: list[str] = []
         self._has_timer = False
@@ -199,7 +200,7 @@ class ProgressDisplay(SearchProgress):
     def __enter__(self) -> ProgressDisplay:
         if not self._silent and _can_use_timer():
             signal.signal(signal.SIGALRM, lambda *_: self._update())
-            # System calls of libraries go on after the signal.
+            # System calls of libraries continue after the signal.
             signal.siginterrupt(signal.SIGALRM, False)
             signal.setitimer(signal.ITIMER_REAL, TICK, TICK)
             self._has_timer = True
@@ -209,7 +210,7 @@ class ProgressDisplay(SearchProgress):
         if self._has_timer:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        # An exception may have come while a line was written.
+        # An exception may have occurred while a line was written.
         self._busy = False
         with self._writing():
             self._erase()
@@ -217,7 +218,12 @@ class ProgressDisplay(SearchProgress):
         self._silent = True
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Begin a stage and show it."""
+        """Begin a stage and show it.
+
+        Args:
+            name: Name of the stage.
+            total: Number of its steps; None if unknown.
+        """
         super().stage(name, total)
         self._update()
 
@@ -227,17 +233,22 @@ class ProgressDisplay(SearchProgress):
         self._update()
 
     def found(self, effects: Sequence[str], share: float) -> None:
-        """Keep the best model so far and show it."""
+        """Store the best model so far and show it.
+
+        Args:
+            effects: Effects of the model.
+            share: Share of the gap that it closes.
+        """
         super().found(effects, share)
         self._update()
 
     def completed(self, share: float) -> None:
-        """Take in the share done and show it."""
+        """Store the share done and show it."""
         super().completed(share)
         self._update()
 
     def note(self, text: str) -> None:
-        """Print a line that stays: above the live line on a terminal."""
+        """Print a permanent line: above the live line on a terminal."""
         if self._silent:
             return
         self._waiting.append(text)
@@ -257,7 +268,7 @@ class ProgressDisplay(SearchProgress):
             self._busy = False
 
     def _update(self) -> None:
-        """Show the state, unless that was done just now."""
+        """Show the state, unless that was done less than an interval ago."""
         if self._silent or self._busy or not self._name:
             return
         now = self._clock()
@@ -281,13 +292,13 @@ class ProgressDisplay(SearchProgress):
         try:
             yield
         except (OSError, ValueError):
-            # Nobody reads stderr any more, or it is closed. The search goes on.
+            # stderr is closed or no longer read; the search continues without display.
             self._silent = True
         finally:
             self._busy = False
 
     def _draw(self) -> None:
-        """Write what waits, then the live line on a terminal."""
+        """Write the waiting lines, then the live line on a terminal."""
         if self._waiting:
             self._erase()
             self._print_waiting()
@@ -299,7 +310,7 @@ class ProgressDisplay(SearchProgress):
         lines = list(self.lines(*_bar_characters(self._stream)))
         line = next((one for one in lines if disp_len(one) <= columns), lines[-1])
         line = disp_trim(line, columns)
-        # A terminal echoes ^C at the end of the line: two characters more are to be overwritten.
+        # A terminal echoes ^C at the end of the line, so two more characters are overwritten.
         rest = min(disp_len(self._shown) + 2, columns) - disp_len(line)
         self._stream.write("\r" + line + " " * max(rest, 0) + "\b" * max(rest, 0))
         self._stream.flush()
@@ -321,7 +332,7 @@ class ProgressDisplay(SearchProgress):
 
 
 def _can_use_timer() -> bool:
-    """Return whether this process has a timer signal that nobody else uses."""
+    """Return whether this process has a timer signal that nothing else uses."""
     is_main = threading.current_thread() is threading.main_thread()
     has_timer = hasattr(signal, "setitimer") and hasattr(signal, "SIGALRM")
     return is_main and has_timer and signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
@@ -337,7 +348,7 @@ def _columns(stream: Any) -> int:
 
 
 def _bar_characters(stream: Any) -> tuple[str, str]:
-    """Return the characters for what is not done and what is done, as far as can be encoded."""
+    """Return the bar's characters for the open part and the done part, in the stream's encoding."""
     try:
         "█░".encode(getattr(stream, "encoding", None) or "ascii")
     except (UnicodeEncodeError, LookupError):

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from bench.study import Study
 
 _FEW = 20
-"""Runs that are listed unless all are asked for."""
+"""Maximum number of runs that are listed without ``--runs``."""
 
 
 def add_status(status: argparse.ArgumentParser) -> None:
-    """The options of `simgap status`."""
+    """Add the options of `simgap status`."""
     status.add_argument(
         "run",
         metavar="DIR",
@@ -42,7 +42,7 @@ def _status(options: argparse.Namespace, say: Say) -> Answer:
 
 
 def _seals(say: Say) -> list[Document]:
-    """Say which seals hold on this machine."""
+    """Print which isolation layers are available on this machine."""
     from bench.runs.housing import seals
     from bench.sealing.seals import SEALS
 
@@ -54,7 +54,7 @@ def _seals(say: Say) -> list[Document]:
 
 
 def _seal(study: Study) -> Document:
-    """How the tuners of a study are kept from its truths."""
+    """Describe how the tuners of a study are isolated from the true parameters."""
     from bench.sealing.seals import SEALS
 
     held = study.configuration
@@ -71,7 +71,7 @@ def _seal(study: Study) -> Document:
 
 
 def _sealed(seal: Document) -> str:
-    """The same in words."""
+    """Format the isolation of a study as text."""
     if seal["trusted"]:
         return "trusted: its tuners run inside the harness"
     missing, salt = seal["missing"], seal["salt_sha256"]
@@ -83,7 +83,7 @@ def _sealed(seal: Document) -> str:
 
 
 def _stands(study: Study, every: bool, say: Say) -> Document:
-    """Say how far a study is."""
+    """Print the progress of a study, and return it as a document."""
     standing = study.status()
     planned, what = len(standing.ends), standing.what
     seal, groups = _seal(study), _counts(standing)
@@ -118,7 +118,7 @@ def _stands(study: Study, every: bool, say: Say) -> Document:
 
 
 def _counts(standing: Standing) -> dict[str, dict[str, int]]:
-    """For each tuner or kind of ball: how many ended how."""
+    """Count the runs of each tuner or kind of ball by status."""
     groups: dict[str, Counter[str]] = {}
     for end in standing.ends:
         groups.setdefault(end.group, Counter())[end.status] += 1
@@ -126,7 +126,7 @@ def _counts(standing: Standing) -> dict[str, dict[str, int]]:
 
 
 def _counted(groups: dict[str, dict[str, int]]) -> list[str]:
-    """The same in words, what is missing last."""
+    """Format the counts as text, missing runs last."""
     from bench.store.standing import MISSING
 
     width = max(map(len, groups), default=0)
@@ -138,7 +138,7 @@ def _counted(groups: dict[str, dict[str, int]]) -> list[str]:
 
 
 def _telling(standing: Standing) -> tuple[End, ...]:
-    """A few of those of which there is something to say."""
+    """Select the runs to list: those without success, or all; at most `_FEW`."""
     from bench.store.standing import FINE
 
     telling = tuple(end for end in standing.ends if end.status not in FINE)
@@ -146,5 +146,5 @@ def _telling(standing: Standing) -> tuple[End, ...]:
 
 
 def _reason(end: End) -> str:
-    # A traceback ends with what went wrong.
+    # The last line of a traceback names the error.
     return (end.reason.strip().splitlines() or [""])[-1]

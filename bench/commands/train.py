@@ -10,7 +10,7 @@ from bench.commands.options import add_force, add_pdf, add_plugin, add_trust, pl
 
 
 def add_train(parser: argparse.ArgumentParser) -> None:
-    """The options of `simgap train`."""
+    """Add the options of `simgap train`."""
     parser.add_argument(
         "tuner",
         metavar="TUNER",

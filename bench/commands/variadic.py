@@ -1,8 +1,8 @@
-"""Positional arguments that follow an option of several values, as in
-``simgap simulate --effect wind=1 pendulum``.
+"""Reorder positional arguments that follow an option with several values.
 
-argparse gives an option with ``nargs="+"`` every word up to the next option, so ``pendulum`` would
-be read as a second effect and the positional argument would be missing.
+An example is ``simgap simulate --effect wind=1 pendulum``. argparse gives an option with
+``nargs="+"`` every word up to the next option, so ``pendulum`` would be read as a second effect and
+the positional argument would be missing.
 """
 
 from __future__ import annotations
@@ -11,19 +11,18 @@ import argparse
 from collections.abc import Iterator, Sequence
 
 _VARIADIC = ("+", "*")
-"""`nargs` of an argument that takes several words."""
+"""Values of `nargs` for an argument that takes several words."""
 
 
 def positionals_first(parser: argparse.ArgumentParser, words: Sequence[str]) -> list[str]:
-    """Move to the front the words that an option of several values would take from the positional
-    arguments.
+    """Move positional arguments to the front that an option with several values would take.
 
-    As many words are moved as there are positional arguments without one. Each is the last word
-    of an option, is not its only word, and cannot be a value: values are NAME=VALUE or numbers.
+    As many words are moved as there are missing positional arguments. Each is the last word of an
+    option, is not its only word, and cannot be a value: values are NAME=VALUE or numbers.
 
     Args:
-        parser: of one command; its positional arguments and options are declared.
-        words: the command line after the command's name.
+        parser: Parser of one command; its positional arguments and options are declared.
+        words: The command line after the command's name.
 
     Returns:
         The words in an order in which argparse reads them as the user meant them.
@@ -45,11 +44,11 @@ def positionals_first(parser: argparse.ArgumentParser, words: Sequence[str]) -> 
 def _groups(
     parser: argparse.ArgumentParser, words: Sequence[str]
 ) -> Iterator[tuple[argparse.Action | None, list[str]]]:
-    """Each option with the words it takes; other words with None."""
+    """Yield each option with the words it takes, and other words with None."""
     rest = list(words)
     while rest:
         word = rest.pop(0)
-        if word == "--":  # all that follows is positional
+        if word == "--":  # Everything after this word is positional.
             yield None, [word, *rest]
             return
         action, attached = _option(parser, word)
@@ -66,8 +65,10 @@ def _groups(
 
 
 def _option(parser: argparse.ArgumentParser, word: str) -> tuple[argparse.Action | None, bool]:
-    """The option that a word names, in full or by a unique beginning, and whether its value is
-    attached, as in ``--effect=wind=1``.
+    """Return the option that a word names, and whether its value is attached.
+
+    The word is the full name or a unique prefix; an example of an attached value is
+    ``--effect=wind=1``.
     """
     name, equals, _ = word.partition("=")
     known = parser._option_string_actions
@@ -81,17 +82,17 @@ def _option(parser: argparse.ArgumentParser, word: str) -> tuple[argparse.Action
 
 
 def _starts_option(word: str) -> bool:
-    """Whether argparse reads a word as an option; a negative number is a value."""
+    """Return whether argparse reads a word as an option; a negative number is a value."""
     return word.startswith("-") and word != "-" and not _is_numbers(word)
 
 
 def _is_value(word: str) -> bool:
-    """Whether a word can be a value of an option of several: NAME=VALUE or numbers."""
+    """Return whether a word can be a value of an option with several: NAME=VALUE or numbers."""
     return "=" in word or _is_numbers(word)
 
 
 def _is_numbers(word: str) -> bool:
-    """Whether a word is a number, or several with commas between."""
+    """Return whether a word is a number, or several separated by commas."""
     try:
         [float(cell) for cell in word.split(",")]
     except ValueError:

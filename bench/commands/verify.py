@@ -9,7 +9,7 @@ from bench.commands.options import add_plugin, place
 
 
 def add_verify(verify: argparse.ArgumentParser) -> None:
-    """The options of `simgap verify`."""
+    """Add the options of `simgap verify`."""
     verify.add_argument(
         "run",
         metavar="RUN",

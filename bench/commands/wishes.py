@@ -1,4 +1,4 @@
-"""``NAME=VALUE`` texts of the command line as values."""
+"""Parse ``NAME=VALUE`` arguments of the command line."""
 
 from __future__ import annotations
 
@@ -10,10 +10,17 @@ from sims.base import InputError
 
 
 def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
-    """NAME=VALUE texts as a dictionary.
+    """Parse NAME=VALUE texts.
+
+    Args:
+        option: Name of the option, for error messages.
+        texts: Arguments of the option.
+
+    Returns:
+        Values by name.
 
     Raises:
-        InputError: a text is none, or a name is given twice.
+        InputError: A text does not have this form, or a name is given twice.
     """
     values: dict[str, str] = {}
     for text in texts:
@@ -27,10 +34,15 @@ def pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
 
 
 def number(option: str, name: str, text: str) -> float:
-    """The finite number in a text.
+    """Parse a finite number.
+
+    Args:
+        option: Name of the option, for error messages.
+        name: Name of the value, for error messages.
+        text: Text of the number.
 
     Raises:
-        InputError: it is none.
+        InputError: The text is not a finite number.
     """
     try:
         value = float(text)
@@ -42,19 +54,24 @@ def number(option: str, name: str, text: str) -> float:
 
 
 def numbers(option: str, texts: Sequence[str]) -> dict[str, float]:
-    """NAME=NUMBER texts."""
+    """Parse NAME=NUMBER texts.
+
+    Args:
+        option: Name of the option, for error messages.
+        texts: Arguments of the option.
+    """
     return {name: number(option, name, text) for name, text in pairs(option, texts).items()}
 
 
 def parameters(texts: Sequence[str]) -> dict[str, float] | list[float]:
-    """Parameters by name, or all of them in order from one text with commas between."""
+    """Parse parameters by name, or all of them in order from one text separated by commas."""
     if len(texts) == 1 and "=" not in texts[0]:
         return [number("--theta", f"value {i}", t) for i, t in enumerate(texts[0].split(","), 1)]
     return numbers("--theta", texts)
 
 
 def coefficients(texts: Sequence[str]) -> dict[str, list[float]]:
-    """NAME=VALUE[,VALUE] texts of effects."""
+    """Parse NAME=VALUE[,VALUE] texts of effects."""
     return {
         name: [number("--effect", name, cell) for cell in text.split(",")]
         for name, text in pairs("--effect", texts).items()
@@ -62,7 +79,7 @@ def coefficients(texts: Sequence[str]) -> dict[str, list[float]]:
 
 
 def noise(texts: Sequence[str]) -> dict[str, float]:
-    """NAME=S texts, and at most one plain S for all that are not named."""
+    """Parse NAME=S texts, and at most one plain S for all channels that are not named."""
     plain = [text for text in texts if "=" not in text]
     if len(plain) > 1:
         raise InputError(
@@ -73,7 +90,7 @@ def noise(texts: Sequence[str]) -> dict[str, float]:
 
 
 def initial(texts: Sequence[str]) -> dict[str, float | tuple[float, float]]:
-    """NAME=VALUE and NAME=LOW:HIGH texts."""
+    """Parse NAME=VALUE and NAME=LOW:HIGH texts of initial states."""
     values: dict[str, float | tuple[float, float]] = {}
     for name, text in pairs("--initial", texts).items():
         low, colon, high = text.partition(":")
@@ -93,10 +110,18 @@ def wish(
     inputs: Sequence[str] = (),
     starts: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Keyword arguments of `bench.recordings.simulate.Wish` from the command line's texts.
+    """Build keyword arguments of `bench.recordings.simulate.Wish` from the command line.
+
+    Args:
+        theta: Texts of ``--theta``.
+        effect: Texts of ``--effect``.
+        constant: Texts of ``--constant``.
+        noises: Texts of ``--noise``.
+        inputs: Texts of ``--input``.
+        starts: Texts of ``--initial``.
 
     Raises:
-        InputError: a text that cannot be read, named with its option.
+        InputError: A text cannot be read; the message names its option.
     """
     return {
         "parameters": parameters(theta),

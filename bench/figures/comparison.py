@@ -1,4 +1,4 @@
-"""The figures of one comparison, by name."""
+"""Draw the figures of one comparison by name."""
 
 from __future__ import annotations
 
@@ -28,15 +28,18 @@ FILES: Mapping[str, str] = {
     "spectra": "identifiability",
     "directions": "stiff-sloppy-prediction",
 }
-"""Every figure's name, in the order in which they are written, and that of its files."""
+"""File name of every figure by its name, in the order in which they are written."""
 
 FRONT = ("error", "misfit", "directions")
-"""Figures of errors against simulations, which references may stand behind."""
+"""Figures of errors against simulations, which can show references in grey."""
 
 
 class Labels(NamedTuple):
-    """What axes are called: the error channel, ``q [rad]``, and the parameter where there is one,
-    ``restitution``; empty for several.
+    """Axis labels of a comparison.
+
+    Attributes:
+        channel: Error channel with unit, e.g. ``q [rad]``.
+        parameter: Name of the parameter, e.g. ``restitution``; empty for several parameters.
     """
 
     channel: str
@@ -44,7 +47,7 @@ class Labels(NamedTuple):
 
 
 def labels_of(problem: Problem) -> Labels:
-    """The labels of a comparison's problem."""
+    """Make the axis labels for a comparison's problem."""
     channel = problem.channels[problem.error_channel]
     parameters = problem.cube.parameters
     parameter = ""
@@ -55,19 +58,19 @@ def labels_of(problem: Problem) -> Labels:
 
 
 def statistics_of(stored: Stored) -> Statistics:
-    """What the tables and some of the figures are made from; at least one run is there."""
+    """Compute the statistics for tables and figures; needs at least one run."""
     return Statistics(stored.experiment, stored.runs, stored.statuses, stored.costs)
 
 
 def names(stored: Stored) -> list[str]:
-    """Names of the figures that a comparison allows; none without a run."""
+    """List the names of the figures that a comparison's data allow; empty without a run."""
     experiment, runs = stored.experiment, stored.runs
     if runs.empty:
         return []
     wide = "wide" in experiment.ranges
     allowed = {
         "error": True,
-        # Without another world the least misfit is the sensor's noise, which shows nothing.
+        # Without a true system other than the simulator, the misfit is only the sensor noise.
         "misfit": bool(experiment.world),
         "distance": wide and bool(runs.loc[runs["range"] == "wide", "outside"].gt(0).any()),
         "runtime": True,
@@ -86,18 +89,17 @@ def figure(
     statistics: Statistics | None = None,
     behind: Sequence[Reference] = (),
 ) -> Figure:
-    """One figure of a comparison.
+    """Draw one figure of a comparison.
 
     Args:
-        stored: the comparison as `bench.store.folder.read` gives it.
-        labels: of its axes, see `labels_of`.
-        name: one of `names(stored)`.
-        statistics: of `statistics_of(stored)`, for who makes several figures.
-        behind: reference results that are drawn in grey behind it, where it is one of `FRONT`.
+        stored: The comparison, as read by `bench.store.folder.read`.
+        labels: Axis labels, see `labels_of`.
+        name: One of `names(stored)`.
+        statistics: Result of `statistics_of(stored)`, to share it between several figures.
+        behind: Reference results that are drawn in grey, if the figure is one of `FRONT`.
 
     Raises:
-        InputError: the comparison has no figure of that name, or a reference cannot be drawn
-            behind it.
+        InputError: The comparison has no figure of that name, or a reference cannot be drawn.
     """
     if name not in (known := names(stored)):
         raise unknown("figure", name, known)
@@ -107,11 +109,16 @@ def figure(
 
 
 def refuse_behind(stored: Stored, name: str, behind: Sequence[Reference]) -> None:
-    """Refuse references that cannot be drawn behind a figure.
+    """Reject references that cannot be drawn in a figure.
+
+    Args:
+        stored: The comparison.
+        name: Name of the figure.
+        behind: Reference results.
 
     Raises:
-        InputError: they are of another problem, too many to be told apart, or the figure shows no
-            errors against simulations.
+        InputError: They are of another problem, there are too many, or the figure shows no errors
+            against simulations.
     """
     if name not in FRONT:
         raise InputError(f"figure {name}: expected one of {', '.join(FRONT)} before a reference")
@@ -148,7 +155,7 @@ def _of_effort(experiment: Experiment, name: str, statistics: Statistics) -> Fig
     style = style_of(experiment, statistics)
     if name == "runtime":
         return runtimes.runtime_figure(experiment, style, statistics)
-    # Tables have every level; a figure has the one at which there is most to see.
+    # Tables contain every level; a figure shows the most informative one.
     level = statistics.level
     draw = runtimes.cost_figure if name == "cost" else runtimes.amortisation_figure
     return draw(experiment, style, statistics.prices[level], level)

@@ -1,7 +1,7 @@
-"""Errors of a comparison against the number of simulations, and against the target's distance from
-the training range.
+"""Draw errors against the number of simulations and against distance from training.
 
-Bands and bars are 95 % bootstrap intervals of the median over targets.
+The distance is that of the target from the training range. Bands and bars are 95 % bootstrap
+intervals of the median over targets.
 """
 
 from __future__ import annotations
@@ -43,16 +43,17 @@ def error_figure(
     parameter: str,
     behind: Sequence[Reference] = (),
 ) -> Figure:
-    """Error against simulations.
+    """Draw the error against simulations.
 
-    One panel a range, or, for a recording, held-out runs beside the runs tuned on.
+    There is one panel per range; for a recording, one for held-out runs and one for the runs used
+    for tuning.
 
     Args:
-        experiment: what was compared.
-        statistics: of it.
-        channel: the error channel with its unit, e.g. ``q [rad]``.
-        parameter: the parameter with its unit where there is one; empty for several.
-        behind: reference results that are drawn in grey behind these.
+        experiment: The experiment.
+        statistics: Its statistics.
+        channel: Error channel with unit, e.g. ``q [rad]``.
+        parameter: Parameter with unit if there is one; empty for several.
+        behind: Reference results that are drawn in grey.
     """
     shown = panels(experiment, statistics, channel, parameter)
     figure, axes = canvas(len(shown))
@@ -70,7 +71,7 @@ def error_figure(
 
 
 class Shown(NamedTuple):
-    """What one panel of `error_figure` shows: a metric in a range, under a title and a label."""
+    """Content of one panel of `error_figure`: a metric in a range, with title and label."""
 
     metric: str
     kind: str
@@ -81,9 +82,16 @@ class Shown(NamedTuple):
 def panels(
     experiment: Experiment, statistics: Statistics, channel: str, parameter: str
 ) -> list[Shown]:
-    """The panels of `error_figure`. Arguments as there."""
+    """List the panels of `error_figure`.
+
+    Args:
+        experiment: The experiment.
+        statistics: Its statistics.
+        channel: Error channel with unit, e.g. ``q [rad]``.
+        parameter: Parameter with unit if there is one; empty for several.
+    """
     runs = statistics.all_runs
-    # Of a recording nobody knows the truth: what counts is its error on what was not fitted.
+    # The true parameters of a recording are unknown, so its error on held-out runs is shown.
     if "real" in experiment.ranges:
         metrics = [m for m in ("heldout_error", "obs_error") if runs[m].notna().any()]
         return [Shown(m, "real", TITLES[m], f"RMSE of {channel}") for m in metrics]
@@ -94,8 +102,15 @@ def panels(
 def misfit_figure(
     experiment: Experiment, statistics: Statistics, channel: str, behind: Sequence[Reference] = ()
 ) -> Figure:
-    """What tuning leaves where the targets come from another simulator: the floor that no parameter
-    removes. Arguments as of `error_figure`.
+    """Draw the misfit against simulations, if the targets come from another simulator.
+
+    Its floor is the model error that no parameter removes.
+
+    Args:
+        experiment: The experiment.
+        statistics: Its statistics.
+        channel: Error channel with unit, e.g. ``q [rad]``.
+        behind: Reference results that are drawn in grey.
     """
     kinds = ranges(experiment, statistics.all_runs)
     figure, axes = canvas(len(kinds))
@@ -114,9 +129,9 @@ def misfit_figure(
 
 
 def least_misfit(runs: pd.DataFrame) -> float:
-    """The least error of the observation that any tuner reached, median over targets.
+    """Compute the smallest observation error that any tuner reached, median over targets.
 
-    Nobody knows the least error there is, but somebody's least bounds it from above.
+    The smallest possible error is unknown; this is an upper bound of it.
     """
     return float(runs.groupby("target")["obs_error"].min().median())
 
@@ -124,13 +139,19 @@ def least_misfit(runs: pd.DataFrame) -> float:
 def samples_panel(
     axis: Axes, statistics: Statistics, metric: str, kind: str, style: Styles
 ) -> None:
-    """Each tuner's median of a metric over targets of a range against simulations, with its
-    interval; references behind it.
+    """Draw each tuner's median of a metric against simulations with its interval.
+
+    Args:
+        axis: Axes to draw on.
+        statistics: Statistics of the comparison.
+        metric: Name of the metric.
+        kind: Range of the targets.
+        style: Styles of the tuners; its references are drawn in grey.
     """
     medians, budget = statistics.medians(metric, kind), style.experiment.budget
     for tuner, line in medians.groupby("tuner", sort=False):
         look, points = style.of(str(tuner)), line["simulations"].to_numpy()
-        # Marks only where tables have numbers; the line goes through all points.
+        # Markers only where tables have numbers; the line goes through all points.
         marks = np.flatnonzero(np.isin(points, checkpoints(budget))).tolist()
         axis.plot(points, line["median"], markevery=marks, markersize=4.5, **look)
         band = {"color": look["color"], "alpha": 0.13, "linewidth": 0}
@@ -147,11 +168,11 @@ def _label_below(axis: Axes, level: float, text: str) -> None:
 
 
 def shade_equal(axis: Axes, floor: float | None) -> None:
-    """Shade the errors that count as equal, where some are drawn.
+    """Shade the errors that count as equal, if some are visible.
 
     Args:
-        axis: of a figure whose panels are all drawn: its limits are fixed from here on.
-        floor: of `bench.analysis.statistics.Statistics.floor_of`.
+        axis: Axes of a figure whose panels are all drawn, since their limits are fixed here.
+        floor: Result of `bench.analysis.statistics.Statistics.floor_of`.
     """
     low, high = axis.get_ylim()
     if floor is None or not low < floor < high:
@@ -164,7 +185,7 @@ def shade_equal(axis: Axes, floor: float | None) -> None:
 def _grey_lines(
     axis: Axes, reference: Reference, kind: str, metric: str, budget: int, style: Styles
 ) -> None:
-    """Each tuner's median of a reference, at the numbers of simulations that its table has."""
+    """Draw each tuner's median of a reference, at the simulation counts of its table."""
     for tuner in reference.tuners:
         curve = reference.curve(tuner, kind, metric, budget)
         if len(curve):
@@ -174,7 +195,7 @@ def _grey_lines(
 
 
 def simulations_axis(axis: Axes, budget: int) -> None:
-    """Simulations along the horizontal axis, logarithmic but for a first piece from 0 to 1."""
+    """Scale the horizontal axis for simulations: logarithmic, but linear from 0 to 1."""
     ticks = checkpoints(budget)
     axis.set_xscale("symlog", linthresh=1, linscale=0.5)
     axis.set_xticks(ticks, [str(k) for k in ticks])
@@ -184,8 +205,12 @@ def simulations_axis(axis: Axes, budget: int) -> None:
 
 
 def distance_figure(experiment: Experiment, statistics: Statistics, parameter: str) -> Figure:
-    """Median error after few, some and all simulations, by how far the target lies outside the
-    training range. Arguments as of `error_figure`.
+    """Draw the median error at several simulation counts by the target's distance from training.
+
+    Args:
+        experiment: The experiment.
+        statistics: Its statistics.
+        parameter: Parameter with unit if there is one; empty for several.
     """
     table = statistics.distances
     shown = moments(experiment.budget)
@@ -209,8 +234,8 @@ def distance_figure(experiment: Experiment, statistics: Statistics, parameter: s
 def _distance_line(axis: Axes, line: pd.DataFrame, tuner: str, style: Styles) -> None:
     middle = line["median"].to_numpy()
     bars = np.array([middle - line["low"], line["high"] - middle])
-    # A single target has no interval. A percentile interval may lie to one side of the median by
-    # rounding; a bar has no such side.
+    # A single target has no interval. By rounding, a percentile interval may not contain the
+    # median; error bars must not be negative.
     lengths = np.maximum(np.nan_to_num(bars), 0.0)
     places = line["bin"].to_numpy() + style.offset(tuner)
     look = style.of(tuner)
@@ -218,15 +243,15 @@ def _distance_line(axis: Axes, line: pd.DataFrame, tuner: str, style: Styles) ->
 
 
 def ranges(experiment: Experiment, runs: pd.DataFrame) -> list[str]:
-    """The experiment's ranges of which there are runs."""
+    """List the experiment's ranges that have runs."""
     return [r for r in experiment.ranges if (runs["range"] == r).any()]
 
 
 def parameter_label(parameter: str) -> str:
-    """What the error of parameters is called.
+    """Return the axis label for the error of parameters.
 
     Args:
-        parameter: the parameter with its unit where there is one; empty for several.
+        parameter: Parameter with unit if there is one; empty for several.
     """
     if parameter:
         return f"absolute error of {parameter}"

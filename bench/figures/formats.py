@@ -1,4 +1,4 @@
-"""Which files a figure is written as: PNG always, PDF on demand.
+"""File formats of figures: PNG always, PDF on request.
 
 Rendering a PDF takes about as long as rendering the PNG, and most PDF files are never opened. The
 commands take ``--pdf``, the functions of `simgap` take ``pdf=True``. Both set it here, so that the
@@ -16,10 +16,10 @@ _WANTED: ContextVar[bool] = ContextVar("pdf_wanted", default=False)
 
 @contextmanager
 def pdf_figures(wanted: bool = True) -> Iterator[None]:
-    """Write every figure as a PDF too, for the duration of the context.
+    """Context in which every figure is also written as PDF.
 
     Args:
-        wanted: False writes none; a context inside one that asks for PDF files still writes them.
+        wanted: Whether to write PDF files; False does not override an outer context with True.
     """
     token = _WANTED.set(wanted or _WANTED.get())
     try:
@@ -29,7 +29,7 @@ def pdf_figures(wanted: bool = True) -> Iterator[None]:
 
 
 def is_pdf_wanted() -> bool:
-    """Whether a PDF file is asked for."""
+    """Return whether PDF files are requested."""
     return _WANTED.get()
 
 
@@ -37,11 +37,11 @@ _command = False
 
 
 def mark_as_command() -> None:
-    """Record that this process runs a command and is no interactive session."""
+    """Record that this process runs a command and is not an interactive session."""
     global _command
     _command = True
 
 
 def is_command() -> bool:
-    """Whether this process runs a command, which shows no docstrings of libraries."""
+    """Return whether this process runs a command, which shows no docstrings of libraries."""
     return _command

@@ -1,4 +1,4 @@
-"""Figures of what data identify: spectra, directions, errors along them, and prediction."""
+"""Draw what data identify: spectra, parameter directions, errors along them, and prediction."""
 
 from __future__ import annotations
 
@@ -33,33 +33,35 @@ if TYPE_CHECKING:
     from bench.store.reference import Reference
 
 _FLOOR = 1e-6
-"""1 sigma in training widths below which a figure shows no difference."""
+"""Standard deviation in training widths below which values are drawn at the edge."""
 _CEILING = 1e4
-"""1 sigma in training widths above which a figure shows no difference."""
+"""Standard deviation in training widths above which values are drawn at the edge."""
 _LEAST_SHARE = 0.05
-"""Share of a parameter in a direction below which it is not written."""
+"""Minimum share of a parameter in a direction that is written."""
 _WHERE = {
     "in": "truth in training range",
     "wide": "truth in bounds",
     "real": "recording, at nominal values",
 }
 _MARKS = (("o", BLUE), ("^", VERMILION))
-"""Of the ranges, in their order."""
+"""Markers and colours of the ranges, in their order."""
 ROWS = {
     "stiff_error": "along stiff directions\n[training widths]",
     "sloppy_error": "along sloppy directions\n[training widths]",
     "heldout_error": "of prediction,\nRMSE of {channel}",
 }
-"""Metrics, and what their axes say."""
+"""Axis labels by metric."""
 
 
 def spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
-    """Left: 1 sigma of every direction, a mark a target. Right: which parameters make up each
+    """Draw the standard deviations along all directions, and the parameters in each direction.
+
+    Left: 1 sigma of every direction, one marker per target. Right: share of each parameter in each
     direction.
 
     Args:
-        experiment: what was compared.
-        table: rows of identifiability.csv.
+        experiment: The experiment.
+        table: Rows of identifiability.csv.
     """
     names = [c for c in table.columns if c not in COLUMNS]
     size = (4.8 + 0.8 * len(names), 2.2 + 0.4 * len(names))
@@ -79,18 +81,18 @@ def spectra_figure(experiment: Experiment, table: pd.DataFrame) -> Figure:
 
 
 def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
-    """Every target's 1 sigma along each direction, the ranges beside each other."""
+    """Draw every target's 1 sigma along each direction, the ranges side by side."""
     ranges = list(dict.fromkeys(table["range"]))
     for place, (kind, (marker, colour)) in enumerate(zip(ranges, _MARKS, strict=False)):
         part = table[table["range"] == kind]
         targets = part["target"].nunique()
-        # Marks of one direction stand side by side within 0.3, the ranges 0.4 apart.
+        # Markers of one direction lie side by side within 0.3, the ranges 0.4 apart.
         places = part.groupby("direction").cumcount()
         within = (places / (targets - 1) - 0.5) * 0.3 if targets > 1 else 0.0 * places
         across = part["direction"] + within + (place - 0.5 * (len(ranges) - 1)) * 0.4
         axis.plot(
             across,
-            # A direction that the data do not touch has an infinite sigma: it is drawn at the edge.
+            # A direction without effect on the data has an infinite sigma and is drawn at the edge.
             part["sigma"].clip(_FLOOR, _CEILING),
             marker,
             color=colour,
@@ -110,7 +112,7 @@ def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
             fontsize=8,
         )
     axis.set_yscale("log")
-    # Room for the legend.
+    # Extra space for the legend.
     axis.set_ylim(bottom=axis.get_ylim()[0] / 10)
     axis.set_xticks(range(1, directions + 1))
     axis.set_xlabel("direction, the stiffest first")
@@ -120,8 +122,8 @@ def _spectra(axis: Axes, table: pd.DataFrame, directions: int) -> None:
 
 
 def _directions(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
-    """Shares of the parameters in each direction, as a grid of numbers."""
-    # A direction has length 1: its squared components are shares, whatever their signs.
+    """Draw the shares of the parameters in each direction, as a grid of numbers."""
+    # A direction has length 1: its squared components are shares, independent of their signs.
     squares = table.set_index("direction")[names] ** 2
     shares = squares.groupby(level=0).mean().to_numpy().T
     axis.imshow(shares, cmap="Greys", vmin=0.0, vmax=1.0, aspect="auto")
@@ -143,9 +145,13 @@ def _directions(axis: Axes, table: pd.DataFrame, names: list[str]) -> None:
 
 
 def directional(experiment: Experiment, runs: pd.DataFrame) -> list[str]:
-    """Metrics of `directions_figure` that the runs have.
+    """List the metrics of `directions_figure` that the runs have.
 
-    None of a recording: its held-out runs are drawn with its errors.
+    A recording has none, since its held-out runs are drawn with its errors.
+
+    Args:
+        experiment: The experiment.
+        runs: Its runs.
     """
     if "real" in experiment.ranges:
         return []
@@ -155,14 +161,15 @@ def directional(experiment: Experiment, runs: pd.DataFrame) -> list[str]:
 def directions_figure(
     experiment: Experiment, statistics: Statistics, channel: str, behind: Sequence[Reference] = ()
 ) -> Figure:
-    """Errors along stiff and along sloppy directions, and of prediction, against simulations; a
-    column a range.
+    """Draw errors along stiff and sloppy directions and of prediction, against simulations.
+
+    Each column of panels is a range.
 
     Args:
-        experiment: what was compared.
-        statistics: of it; its runs have some metric of `directional`.
-        channel: the error channel with its unit, e.g. ``q [rad]``.
-        behind: reference results that are drawn in grey behind these.
+        experiment: The experiment.
+        statistics: Its statistics, with at least one metric of `directional`.
+        channel: Error channel with unit, e.g. ``q [rad]``.
+        behind: Reference results that are drawn in grey.
     """
     runs = statistics.all_runs
     metrics = directional(experiment, runs)
@@ -184,7 +191,7 @@ def directions_figure(
             if axis is row[0]:
                 what = ROWS[metric].format(channel=channel)
                 axis.set_ylabel(f"error {what}\nmedian", fontsize=9)
-            # Rows share their horizontal axis: it is named under the last.
+            # Rows share their horizontal axis, which is labelled below the last row only.
             if metric != metrics[-1]:
                 axis.set_xlabel("")
     for row, metric in zip(axes, metrics, strict=True):

@@ -1,4 +1,4 @@
-"""A robot as links and joints: what is drawn where nothing can be rendered."""
+"""Draw a robot as links and joints, for machines that cannot render it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,20 @@ if TYPE_CHECKING:
     from sims.robot.model import Joint, Robot
 
 TICK = 0.07
-"""Length of an axis of a joint to either side, as a share of the picture."""
+"""Length of a joint's axis to either side, as a fraction of the picture's size."""
 HEAD_ON = 0.25
-"""Share of an axis that is seen below which it points at the reader, and is not drawn."""
+"""Minimum length of the projected joint axis of length 1; a shorter axis points at the viewer."""
 
 
 def draw_links(axis: Axes, robot: Robot, data: Any, view: View) -> None:
-    """Links as lines between the anchors of joints, joints as dots with a tick along each axis."""
+    """Draw links as lines between joint anchors, and joints as dots with a tick along each axis.
+
+    Args:
+        axis: Axes to draw on.
+        robot: The robot.
+        data: MuJoCo data at the pose.
+        view: Camera view.
+    """
     for begin, end in links(robot, data):
         line = view.seen(np.stack([begin, end]))
         axis.plot(
@@ -36,8 +43,14 @@ def draw_links(axis: Axes, robot: Robot, data: Any, view: View) -> None:
 
 
 def links(robot: Robot, data: Any) -> list[tuple[Array, Array]]:
-    """Ends (3,) of each link: from the joint of the body that carries it to its own, and from the
-    last joint to the end of the last body.
+    """Compute the end points (3,) of each link.
+
+    A link extends from the joint of the parent body to the body's own joint, or from the last joint
+    to the end of the last body.
+
+    Args:
+        robot: The robot.
+        data: MuJoCo data at the pose.
     """
     model = robot.compiled
     found = []
@@ -57,14 +70,16 @@ def links(robot: Robot, data: Any) -> list[tuple[Array, Array]]:
 
 
 def _begin(model: Any, data: Any, body: int) -> Array:
-    """(3,) the anchor of the body's first joint; its origin where it has none."""
+    """Return (3,) the anchor of a body's first joint, or the body's origin without a joint."""
     first = int(model.body_jntadr[body])
     return np.array(data.xanchor[first] if first >= 0 else data.xpos[body])
 
 
 def _end(model: Any, data: Any, body: int, begin: Array) -> Array:
-    """(3,) the end of a body that carries no other: of its shapes what is furthest from the joint,
-    else as far behind its centre of mass as that is from the joint.
+    """Return (3,) the end of a body without child bodies.
+
+    It is the point of its shapes that is furthest from the joint; without shapes, the joint
+    mirrored at the centre of mass.
     """
     points = [2 * data.xipos[body] - begin]
     for g in range(model.ngeom):
@@ -79,7 +94,7 @@ def _end(model: Any, data: Any, body: int, begin: Array) -> Array:
 
 
 def _bases(robot: Robot, data: Any) -> list[Array]:
-    """(3,) each: where what moves is fixed to what does not; what floats is fixed to nothing."""
+    """Return the (3,) points where moving bodies are fixed to static ones, without free bodies."""
     model = robot.compiled
     afloat = {int(model.jnt_bodyid[joint.id]) for joint in robot.joints if joint.kind == "free"}
     found = []
@@ -96,7 +111,7 @@ def _draw_joint(axis: Axes, joint: Joint, data: Any, view: View) -> None:
     x, y = view.seen(anchor[None])[0]
     if joint.single:
         along = view.axes[:2] @ data.xaxis[joint.id]
-        # An axis that points at the reader has no direction to draw.
+        # An axis that points at the viewer has no direction to draw.
         if float(np.linalg.norm(along)) > HEAD_ON:
             reach = TICK * max(view.width, view.height) * along
             middle = np.array([x, y])

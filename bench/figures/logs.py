@@ -1,4 +1,4 @@
-"""Figures of many logs that are explained each by itself: a row a log."""
+"""Draw figures of many logs that are explained separately, one row per log."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NAMED = 40
-"""Logs that stand with their names; more have their number."""
+"""Maximum number of logs that are labelled with names; more are labelled with numbers."""
 PANELS = 4
-"""Numbers that are drawn side by side."""
+"""Maximum number of panels side by side."""
 _NAME_LINE = 34
-"""Longest line of a log's name, in characters."""
+"""Maximum line length of a log's name, in characters."""
 _TITLE_LINE = 34
-"""Longest line above a panel, in characters."""
+"""Maximum line length of a panel's title, in characters."""
 _PANEL = 2.8
-"""Width of a panel, in inches: room for such a line."""
+"""Width of a panel in inches, enough for such a title."""
 _LINE = 0.15
-"""Height of a line, in inches."""
+"""Height of a line in inches."""
 
 
 def held_out(logs: pd.DataFrame) -> Figure:
-    """The error on held-out runs before and after, in noise floors.
+    """Draw the error on held-out runs before and after, in units of the noise floor.
 
     Args:
-        logs: a row a log: number, log, before, after; NaN where there is none.
+        logs: One row per log: number, log, before, after; NaN where there is none.
     """
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -40,7 +40,7 @@ def held_out(logs: pd.DataFrame) -> Figure:
     rows = logs["number"].to_numpy()
     before, after = logs["before"].to_numpy(), logs["after"].to_numpy()
     panel.hlines(rows, after, before, color=SOFT, linewidth=0.8)
-    # Hollow before, filled after: told apart in grey too.
+    # Hollow before, filled after: distinguishable in greyscale, too.
     hollow = {"color": VERMILION, "marker": "s", "markerfacecolor": "white"}
     panel.plot(before, rows, linestyle="", label="before: tuned simulation", **hollow)
     panel.plot(
@@ -59,12 +59,12 @@ def held_out(logs: pd.DataFrame) -> Figure:
 
 
 def numbers(logs: pd.DataFrame, found: pd.DataFrame) -> Figure:
-    """Each number of each cause over the logs, with its 95 % interval.
+    """Draw each coefficient of each cause over the logs, with its 95 % interval.
 
     Args:
-        logs: a row a log: number, log.
-        found: a row a number of a log: number, what, value, low, high; the commonest first, of
-            which `PANELS` are drawn.
+        logs: One row per log: number, log.
+        found: One row per coefficient and log: number, what, value, low, high; the most common
+            first, of which `PANELS` are drawn.
     """
     names = list(dict.fromkeys(found["what"]))[:PANELS]
     titles = [
@@ -89,8 +89,8 @@ def numbers(logs: pd.DataFrame, found: pd.DataFrame) -> Figure:
 
 
 def _names(logs: pd.DataFrame) -> list[str]:
-    """The names of the logs, in as many lines as they need."""
-    # Dollars would be mathematics to whoever draws the text.
+    """Return the names of the logs, broken into lines."""
+    # Matplotlib would read dollar signs as mathematics.
     return [break_name(str(name), _NAME_LINE).replace("$", r"\$") for name in logs["log"]]
 
 
@@ -100,7 +100,7 @@ def _height(logs: pd.DataFrame) -> float:
 
 
 def _rows(panel: Axes, logs: pd.DataFrame) -> None:
-    """The logs from above down, by name where there is room."""
+    """Set the vertical axis to the logs from top to bottom, with names if there is space."""
     plain(panel)
     panel.set_ylim(logs["number"].max() + 0.6, logs["number"].min() - 0.6)
     if len(logs) <= NAMED:

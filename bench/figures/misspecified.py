@@ -1,5 +1,7 @@
-"""Figures of what a missing effect does to tuners: bias of a parameter, prediction of unseen runs,
-and ranks, in the simulator as it is and in the extended one.
+"""Draw the effect of model misspecification on tuners.
+
+The figures show the bias of a parameter, the prediction of unseen runs, and ranks, in the simulator
+as it is and in the extended one.
 """
 
 from __future__ import annotations
@@ -22,41 +24,46 @@ _LOOKS: dict[str, dict[str, Any]] = {
     "plain": {"color": VERMILION, "marker": "s", "markerfacecolor": "white"},
     "extended": {"color": BLUE, "marker": "o"},
 }
-"""Hollow before, filled after: told apart in grey too."""
+"""Marker styles by simulator: hollow before, filled after, distinguishable in greyscale."""
 _NAMES = {"plain": "simulator as it is", "extended": "extended by explain"}
 _REFERENCE = "least_squares"
-"""The tuner whose bias is the model's own: it finds the best fit where there is one."""
+"""Tuner whose bias is taken as the model's own, since it finds the best fit if there is one."""
 _COLUMNS = 3
 
 
 class System(Protocol):
-    """What is drawn of one study."""
+    """Data of one study to draw."""
 
     @property
     def experiment(self) -> Experiment:
-        """That was studied."""
+        """The experiment of the study."""
 
     @property
     def unit(self) -> str:
-        """Of the error channel."""
+        """Unit of the error channel."""
 
     @property
     def channel(self) -> str:
-        """Its name."""
+        """Name of the error channel."""
 
     @property
     def name(self) -> str:
-        """A short one."""
+        """A short name of the study."""
 
     def tuners(self) -> list[str]:
-        """Labels in the order of the experiment."""
+        """Return the labels of the tuners in the order of the experiment."""
 
     def targets(self) -> list[str]:
-        """Names."""
+        """Return the names of the targets."""
 
 
 def bias(systems: Sequence[System], table: pd.DataFrame) -> Figure:
-    """Signed error of each system's most biased parameter, by tuner."""
+    """Draw the signed error of each system's most biased parameter, by tuner.
+
+    Args:
+        systems: The studies, one panel each.
+        table: Rows of their error tables.
+    """
     figure, panels = _panels(len(systems))
     for panel, one in zip(panels, systems, strict=False):
         lines = table[(table["experiment"] == one.experiment.name) & (table["metric"] == "bias")]
@@ -74,7 +81,12 @@ def bias(systems: Sequence[System], table: pd.DataFrame) -> Figure:
 
 
 def prediction(systems: Sequence[System], table: pd.DataFrame) -> Figure:
-    """Error in unseen runs, by tuner."""
+    """Draw the prediction error in unseen runs, by tuner.
+
+    Args:
+        systems: The studies, one panel each.
+        table: Rows of their error tables.
+    """
     figure, panels = _panels(len(systems))
     for panel, one in zip(panels, systems, strict=False):
         mine = table["experiment"] == one.experiment.name
@@ -91,7 +103,13 @@ def prediction(systems: Sequence[System], table: pd.DataFrame) -> Figure:
 
 
 def slopes(systems: Sequence[System], ranks: pd.DataFrame, ranking: pd.DataFrame) -> Figure:
-    """Mean ranks in both simulators, a row of panels a metric, a column a system."""
+    """Draw mean ranks in both simulators, one row of panels per metric, one column per system.
+
+    Args:
+        systems: The studies.
+        ranks: Rows of their rank tables.
+        ranking: Rank agreement (Kendall's tau, p-value) of each study and metric.
+    """
     metrics = {"param_error": "error of the parameters", "heldout_error": "prediction"}
     width = max(6.0, 2.6 + 1.75 * len(systems))
     figure, axes = blank(len(metrics), len(systems), (width, 6.6), sharey=True)
@@ -129,12 +147,12 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
 
 
 def _compared(panel: Axes, one: System, lines: pd.DataFrame) -> None:
-    """A row a tuner: both simulators with their intervals."""
+    """Draw one row per tuner with both simulators and their intervals."""
     tuners = one.tuners()
     for shift, model in zip((-0.16, 0.16), _MODELS, strict=True):
         part = lines[lines["model"] == model].set_index("tuner").reindex(tuners)
         mean = part["mean"].to_numpy(dtype=np.float64)
-        # A mean's own interval contains it but for rounding.
+        # A mean's own interval contains it except for rounding.
         bars = [np.maximum(mean - part["low"], 0.0), np.maximum(part["high"] - mean, 0.0)]
         panel.errorbar(
             mean,
@@ -153,7 +171,10 @@ def _compared(panel: Axes, one: System, lines: pd.DataFrame) -> None:
 
 
 def _most_biased(lines: pd.DataFrame) -> str:
-    """The parameter that the reference, or whoever there is, gets most wrong beforehand."""
+    """Return the parameter with the largest bias in the simulator as it is.
+
+    The bias is that of the reference tuner, or of all tuners without it.
+    """
     before = lines[lines["model"] == "plain"]
     reference = before[before["tuner"] == _REFERENCE]
     sizes = (reference if len(reference) else before).groupby("parameter", sort=False)["mean"]

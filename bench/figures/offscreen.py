@@ -1,8 +1,8 @@
-"""A robot rendered where nobody sees a window: in a process of its own, which may fail as it likes.
+"""Render a robot without a window, in a separate process that may fail.
 
-A missing or broken GL raises, prints or ends the process that asks it; which one is asked is fixed
-when MuJoCo is first imported. So a child is asked, its output is kept from the terminal, and where
-it brings no picture there is none.
+A missing or broken OpenGL raises an exception, prints, or ends its process; and its kind is fixed
+when MuJoCo is first imported. Therefore a child process renders, its output is hidden from the
+terminal, and if it fails there is no image.
 """
 
 from __future__ import annotations
@@ -22,36 +22,39 @@ from sims.base import Array
 
 Image = NDArray[np.uint8]
 DOTS = 900
-"""Of the longer side of a picture."""
+"""Size of the longer side of an image, in pixels."""
 SECONDS = 60.0
-"""A picture that takes longer is not waited for."""
+"""Time limit for rendering an image, in seconds."""
 FAR = 4.0
-"""Distance of the camera in sizes of what it shows: nothing reaches behind it."""
+"""Ratio of the camera's distance to the size of the scene; no part reaches behind it."""
 _START = (
     "import sys; sys.path[:] = {path!r}; "
     "from bench.figures.offscreen import main; main(sys.argv[1])"
 )
 _failed: set[str] = set()
-"""Kinds of GL that have brought no picture in this process: each is asked once."""
+"""OpenGL backends that failed in this process; each is tried only once."""
 
 
 def backends() -> tuple[str, ...]:
-    """Kinds of GL to ask, by MuJoCo's names; none where the user has switched it off."""
+    """List the OpenGL backends to try, by MuJoCo's names; none if the user has disabled it."""
     chosen = os.environ.get("MUJOCO_GL", "").lower()
     if chosen in ("disable", "disabled", "off", "false", "0"):
         return ()
-    # Elsewhere MuJoCo's own choice needs no window.
+    # On other platforms MuJoCo's default needs no window.
     usual = ("egl", "osmesa") if sys.platform.startswith("linux") else ("",)
     return (chosen, *usual) if chosen in ("egl", "osmesa") else usual
 
 
 def rendered(model: Any, positions: Array, view: View) -> Image | None:
-    """(H, W, 3) the robot in grey on white; None where this machine cannot draw it.
+    """Render the robot in grey on white.
 
     Args:
         model: mujoco.MjModel.
-        positions: (nq,) of its joints.
-        view: what to show.
+        positions: (nq,) positions of its joints.
+        view: Camera view.
+
+    Returns:
+        (H, W, 3) image; None if this machine cannot render it.
     """
     for backend in backends():
         if backend in _failed:
@@ -64,11 +67,11 @@ def rendered(model: Any, positions: Array, view: View) -> Image | None:
 
 
 def _asked(backend: str, model: Any, positions: Array, view: View) -> Image | None:
-    """The picture by one kind of GL; None if it fails."""
+    """Render the image with one OpenGL backend; return None if it fails."""
     import mujoco
 
     environment = dict(os.environ)
-    # Another kind of GL of the user's would be asked instead.
+    # This variable of the user would select another backend.
     environment.pop("PYOPENGL_PLATFORM", None)
     if backend:
         environment["MUJOCO_GL"] = backend
@@ -93,7 +96,7 @@ def _asked(backend: str, model: Any, positions: Array, view: View) -> Image | No
 
 
 def main(folder: str) -> None:
-    """Draw what `_asked` has put into a folder; any fault ends the process."""
+    """Render the request that `_asked` has stored in a folder; any error ends the process."""
     import mujoco
 
     place = Path(folder)
@@ -108,17 +111,17 @@ def main(folder: str) -> None:
 
 
 def _drawn(mujoco: Any, model: Any, data: Any, view: View) -> Image:
-    """The robot in grey; what is behind it is white."""
+    """Render the robot in grey on a white background."""
     scale = DOTS / max(view.width, view.height)
     rows, columns = (max(2, round(scale * size)) for size in (view.height, view.width))
     whole = model.vis.global_
     whole.offwidth, whole.offheight = columns, rows
-    # Without perspective this is the height of what is shown.
+    # In an orthographic projection, fovy is the visible height.
     whole.orthographic, whole.fovy = 1, view.height
     size = float(np.hypot(view.width, view.height))
     model.stat.extent = size
     model.vis.map.znear, model.vis.map.zfar = 0.01, 3 * FAR
-    # Shadows and mirrors say nothing about a place.
+    # Shadows and reflections give no information about places.
     model.light_castshadow[:] = 0
     model.mat_reflectance[:] = 0
     _without_ground(mujoco, model)
@@ -137,19 +140,27 @@ def _drawn(mujoco: Any, model: Any, data: Any, view: View) -> Image:
 
 
 def greyed(colours: Array, shape: NDArray[np.bool_]) -> Image:
-    """(H, W, 3) light greys where there is a shape, white elsewhere: marks stand out on them."""
+    """Convert an image to light greys on white, so that marks are clearly visible.
+
+    Args:
+        colours: (H, W, 3) colours from 0 to 255.
+        shape: (H, W) mask of the robot.
+
+    Returns:
+        (H, W, 3) grey image.
+    """
     # Luma of ITU-R BT.601.
     luma = colours @ (0.299, 0.587, 0.114)
     seen = luma[shape]
     low, high = np.quantile(seen, [0.02, 0.98]) if seen.size else (0.0, 1.0)
-    # Whatever a robot's own colours: from a middle grey to a light one.
+    # The robot's own range of luma is mapped to medium to light grey.
     share = np.clip((luma - low) / max(high - low, 1.0), 0.0, 1.0)
     grey = np.where(shape, 120 + 112 * share, 255)
     return np.repeat(grey.round().astype(np.uint8)[:, :, None], 3, axis=2)
 
 
 def _without_ground(mujoco: Any, model: Any) -> None:
-    """Leave out floors, which fill the picture."""
+    """Hide floors, which would fill the image."""
     endless = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
     for g in range(model.ngeom):
         if int(model.geom_type[g]) in endless:

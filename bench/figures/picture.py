@@ -1,4 +1,4 @@
-"""A figure that shows itself in a notebook."""
+"""Matplotlib figure that displays itself in a notebook."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from bench.figures.formats import is_command
 
 @contextmanager
 def _without_tables_of_properties() -> Iterator[None]:
-    """Load Matplotlib without the tables of properties in its docstrings in a command: they take a
-    sixth of the time of the import.
+    """Context that skips the property tables in Matplotlib's docstrings if a command runs.
+
+    They take a sixth of the import time.
     """
     tables = matplotlib.artist.kwdoc
     if is_command():
@@ -34,10 +35,10 @@ with _without_tables_of_properties():
 
 
 class Picture(Figure):
-    """A figure that pyplot does not know of, and that a notebook's cell shows all the same.
+    """A figure without pyplot that a notebook's cell displays as an image.
 
-    A notebook shows figures as pictures only after pyplot has told it how; one that was made
-    without pyplot would be shown as a line of text.
+    A notebook displays figures as images only after pyplot has registered them; without pyplot, a
+    figure would be shown as a line of text.
     """
 
     def _repr_png_(self) -> bytes:

@@ -1,7 +1,7 @@
 """Encode drawings as PNG files (ISO/IEC 15948:2004).
 
-Pillow tries five filters on each row, which pays for photographs. Drawings are mostly rows of equal
-pixels: without a filter they take half the time and give smaller files.
+Pillow tests five filters on each row, which is useful for photographs. Drawings mostly consist of
+rows of equal pixels: without a filter they take half the time and give smaller files.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _EIGHT_BITS_RGB = (8, 2, 0, 0, 0)
 """Bit depth, colour type, compression, filter method and interlacing of the header."""
 _LEVEL = 3
-"""Level of the compression: the usual 6 takes twice the time for files as large."""
+"""Compression level: the default 6 takes twice the time for files of the same size."""
 _METRE = 39.3701
-"""Inches in a metre."""
+"""Number of inches in a metre."""
 
 
 def encoded_png(rgba: bytes | memoryview, height: int, width: int, dpi: float) -> bytes:
-    """Encode an opaque picture as the bytes of a PNG file.
+    """Encode an opaque image as the bytes of a PNG file.
 
     Args:
-        rgba: red, green, blue and opacity of each pixel, row by row; the opacity is left out.
-        height: number of rows.
-        width: pixels of a row.
-        dpi: dots an inch, for programs that print the file.
+        rgba: Red, green, blue and opacity of each pixel, row by row; the opacity is ignored.
+        height: Number of rows.
+        width: Number of pixels per row.
+        dpi: Dots per inch, for programs that print the file.
 
     Raises:
-        ValueError: there are not so many pixels.
+        ValueError: The number of pixels is not height times width.
     """
     pixels = np.frombuffer(rgba, dtype=np.uint8).reshape(height, width, 4)[:, :, :3]
     # Each row begins with the number of its filter: 0 for none.
@@ -49,5 +49,5 @@ def encoded_png(rgba: bytes | memoryview, height: int, width: int, dpi: float) -
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:
-    """A chunk of a PNG file with its length and checksum."""
+    """Return a chunk of a PNG file with its length and checksum."""
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

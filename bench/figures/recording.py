@@ -1,6 +1,4 @@
-"""A recording drawn: every input and channel over time, the runs end to end, held-out runs on grey
-ground.
-"""
+"""Draw a recording: every input and channel over time, runs end to end, held-out runs shaded."""
 
 from __future__ import annotations
 
@@ -21,22 +19,20 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 _MOST_RUNS = 40
-"""Runs that are drawn: of more, some evenly chosen."""
+"""Maximum number of runs that are drawn; of more, evenly spaced ones are drawn."""
 _MOST_POINTS = 4000
-"""Points drawn of one run; of a longer one the extremes of each part are drawn."""
+"""Maximum number of points per run; of a longer run the extremes of each part are drawn."""
 _FEW_SAMPLES = 60
-"""Samples of a run up to which each has a mark of its own."""
+"""Maximum number of samples of a run for which each sample has a marker."""
 _APART = 0.015
-"""Gap between runs on the common axis, as a share of their total length over the root of their
-number.
-"""
+"""Gap between runs on the time axis, times the root of their number, over their total length."""
 _DPI = 150
 _FITTING = BLUE
 _HELD_OUT = RUST
 
 
 class _Placed(NamedTuple):
-    """A run where it stands on the common axis: its first instant is drawn at `begin`."""
+    """A run on the common time axis, where its first sample is drawn at `begin`."""
 
     run: Run
     begin: float
@@ -48,23 +44,28 @@ class _Placed(NamedTuple):
 
 
 def draw(recording: Recording, kind: type[Simulator], folder: Path) -> list[Path]:
-    """Draw the recording into `folder` as PNG, and as PDF where one is asked for.
+    """Write the figure of a recording into `folder` as PNG, and as PDF if requested.
+
+    Args:
+        recording: Recording to draw.
+        kind: Simulator class of its system.
+        folder: Folder to write.
 
     Returns:
-        The files, which have the recording's name.
+        Paths of the files, named after the recording.
 
     Raises:
-        InputError: the folder cannot be made or written to.
+        InputError: The folder cannot be made or written to.
     """
     return save(recording_figure(recording, kind), folder / recording.path.stem, _DPI)
 
 
 def recording_figure(recording: Recording, kind: type[Simulator]) -> Figure:
-    """The recording: a panel each input and channel.
+    """Draw a recording with a panel for each input and channel.
 
     Args:
-        recording: what was recorded.
-        kind: the simulator of its system, which knows names and units.
+        recording: Recording to draw.
+        kind: Simulator class of its system, which declares names and units.
     """
     signals = declared(recording, kind)
     placed = _placed(recording.runs)
@@ -95,11 +96,11 @@ def _pretty(unit: str) -> str:
 
 
 def _placed(runs: Sequence[Run]) -> list[_Placed]:
-    """The runs one behind the other, a little apart; of very many, some evenly chosen."""
+    """Place runs end to end with small gaps; of too many runs, use evenly spaced ones."""
     if len(runs) > _MOST_RUNS:
         chosen = np.linspace(0, len(runs) - 1, _MOST_RUNS).round().astype(int)
         runs = [runs[i] for i in chosen]
-    # The more runs, the less room between them.
+    # The more runs, the smaller the gaps between them.
     lengths = [float(run.times[-1] - run.times[0]) for run in runs]
     apart = _APART * sum(lengths) / max(1.0, len(runs) ** 0.5)
     begins = np.concatenate([[0.0], np.cumsum(np.array(lengths) + apart)[:-1]])
@@ -107,13 +108,13 @@ def _placed(runs: Sequence[Run]) -> list[_Placed]:
 
 
 def _panel(axis: Axes, part: _Placed, values: Array) -> None:
-    """One signal of one run."""
+    """Draw one signal of one run."""
     times = part.times
     if part.run.held_out:
         axis.axvspan(float(times[0]), float(times[-1]), color=GROUND, linewidth=0)
     missing = np.isnan(values)
     t, y = _thinned(times, values)
-    # A sample between two missing ones is no line: it needs a mark to be seen.
+    # A sample between two missing ones forms no line and needs a marker to be visible.
     marked = values.size <= _FEW_SAMPLES or missing.mean() > 0.2
     colour = _HELD_OUT if part.run.held_out else _FITTING
     marker = "." if marked else ""
@@ -125,9 +126,7 @@ def _panel(axis: Axes, part: _Placed, values: Array) -> None:
 
 
 def _thinned(times: Array, values: Array) -> tuple[Array, Array]:
-    """At most about `_MOST_POINTS` points that look the same: the least and the largest of each
-    stretch.
-    """
+    """Decimate a signal to about `_MOST_POINTS` points: the extremes of each part."""
     if values.size <= _MOST_POINTS:
         return times, values
     size = -(-values.size // (_MOST_POINTS // 2))
@@ -154,7 +153,7 @@ def _finish(axes: Sequence[Axes], placed: Sequence[_Placed]) -> None:
 
 
 def _named(axis: Axes, placed: Sequence[_Placed]) -> None:
-    """Names of the runs above the first panel."""
+    """Write the names of the runs above the first panel."""
     for part in placed:
         middle = float(part.times[[0, -1]].mean())
         axis.annotate(
@@ -177,7 +176,7 @@ def _titled(axis: Axes, recording: Recording, placed: Sequence[_Placed]) -> None
 
 
 def _marks(recording: Recording, placed: Sequence[_Placed]) -> list[Line2D]:
-    """What the legend explains: only what there is."""
+    """Make the legend entries for the marks that are present."""
     from matplotlib.lines import Line2D
 
     marks = [Line2D([], [], color=_FITTING, label="for fitting")]

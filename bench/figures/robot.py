@@ -1,8 +1,8 @@
-"""A robot drawn at a pose, with the places marked that a verdict names.
+"""Draw a robot at a pose, with the places of a verdict marked.
 
-Rendered where this machine can, else as links and joints; places are marked the same way in both.
-Labels stand in columns to both sides, each tied to its place by a line, so that none covers
-another.
+The robot is rendered if this machine can do so, else drawn as links and joints; places are marked
+identically in both. Labels are arranged in columns at both sides, each connected to its place by a
+line, so that no label covers another.
 """
 
 from __future__ import annotations
@@ -27,30 +27,33 @@ if TYPE_CHECKING:
     from sims.robot.model import Robot
 
 LONGEST = 4.4
-"""Inches of the longer side of the drawing."""
+"""Length of the longer side of the drawing, in inches."""
 COLUMN = 2.1
-"""Inches of a column of labels, at least."""
+"""Minimum width of a column of labels, in inches."""
 LETTER = 0.083
-"""Inches of a letter of a label, on average."""
+"""Average width of a letter of a label, in inches."""
 FOOT = 0.55
-"""Inches below the drawing, for the scale."""
+"""Height below the drawing for the scale bar, in inches."""
 MOST_NAMED = 12
-"""Joints up to which all are named; of more, those that are marked."""
+"""Maximum number of joints that are all named; with more, only marked joints are named."""
 LETTERS = 34
-"""Of a line of a label."""
+"""Maximum length of a line of a label, in characters."""
 MOST_LETTERS = 120
-"""Of a text in a label, which may have several lines."""
+"""Maximum length of a text in a label, which may have several lines, in characters."""
 _LINE = 0.155
-"""Inches from a line of a label to the next."""
+"""Distance between lines of a label, in inches."""
 _BETWEEN = 0.09
-"""Inches between labels."""
+"""Distance between labels, in inches."""
 _SIZES: Mapping[str, tuple[str, float]] = {
     "joint": ("o", 17.0),
     "actuator": ("s", 22.0),
     "body": ("D", 17.0),
     "channel": ("^", 25.0),
 }
-"""Shape and size of a mark, in points, by the kind of its place: two at one place are both seen."""
+"""Marker shape and size in points by the kind of place.
+
+The sizes differ so that two marks at one place are both visible.
+"""
 
 
 @dataclass(frozen=True)
@@ -59,9 +62,9 @@ class Mark:
 
     Attributes:
         kind: ``joint``, ``actuator``, ``body`` or ``channel``.
-        name: of the place.
-        says: what is there, such as ``Coulomb friction``; may be empty.
-        sure: whether it is this place; drawn dashed where it may be another.
+        name: Name of the place.
+        says: Effect at the place, such as ``Coulomb friction``; may be empty.
+        sure: Whether the place is certain; it is drawn dashed if it may be another place.
     """
 
     kind: str
@@ -71,7 +74,7 @@ class Mark:
 
 
 class _Label(NamedTuple):
-    """A label: its lines, the (2,) metres of its place, and whether that is marked."""
+    """A label: its lines, its (2,) point in metres, and whether that point is marked."""
 
     lines: tuple[str, ...]
     point: Array
@@ -79,20 +82,20 @@ class _Label(NamedTuple):
 
     @property
     def height(self) -> float:
-        """Inches."""
+        """Height in inches."""
         return _LINE * len(self.lines) + _BETWEEN
 
 
 def robot_figure(
     robot: Robot, positions: Mapping[str, float], marks: Sequence[Mark] = (), least: float = 0.0
 ) -> Figure:
-    """The robot at a pose, with places marked.
+    """Draw the robot at a pose, with places marked.
 
     Args:
-        robot: what to draw.
-        positions: rad or m by joint; a joint that is not named stands where the file has it.
-        marks: places; one that the robot does not have is left out.
-        least: inches that the figure is wide at least.
+        robot: Robot to draw.
+        positions: Positions by joint, rad or m; other joints keep the position of the model file.
+        marks: Places to mark; places that the robot does not have are ignored.
+        least: Minimum width of the figure in inches.
     """
     data = posed(robot, dict(positions))
     seen_from = view(robot, data)
@@ -120,7 +123,7 @@ def robot_figure(
         draw_links(axis, robot, data, seen_from)
     else:
         axis.imshow(image, extent=(-across, across, -up, up), zorder=0, aspect="auto")
-        # Shapes may be lacking between joints: their meshes were absent, or never drawn.
+        # Shapes may be missing between joints, if their meshes are absent or were never drawn.
         for ends in links(robot, data):
             axis.plot(*seen_from.seen(np.stack(ends)).T, color=SOFT, linewidth=0.7, zorder=3)
         dots = seen_from.seen(np.array([data.xanchor[j.id] for j in robot.joints]))
@@ -137,8 +140,15 @@ def robot_figure(
 def joints_in(
     figure: Figure, robot: Robot, positions: Mapping[str, float]
 ) -> list[tuple[str, float, float]]:
-    """Where the joints are in the figure at that pose: shares of its width and height, from above
-    left.
+    """Compute the positions of the joints in a figure of the robot.
+
+    Args:
+        figure: Figure made by `robot_figure`.
+        robot: The robot.
+        positions: Positions by joint of that figure.
+
+    Returns:
+        Name of each joint, and its position as fractions of width and height from the top left.
     """
     data = posed(robot, dict(positions))
     seen_from = view(robot, data)
@@ -153,13 +163,13 @@ def joints_in(
 
 
 def _shaped(robot: Robot) -> bool:
-    """Whether there is anything to render: a file whose meshes are absent has no shapes."""
+    """Return whether there is anything to render; a robot without its meshes has no shapes."""
     model = robot.compiled
     return any(int(model.body_weldid[body]) for body in model.geom_bodyid.tolist())
 
 
 def _labels(robot: Robot, data: Any, seen_from: View, marks: Sequence[Mark]) -> list[_Label]:
-    """Labels of marked places, each once, and of the other joints."""
+    """Make one label for each marked place, and for the other joints if there are few."""
     said: dict[tuple[str, str], list[str]] = {}
     for mark in marks:
         lines = said.setdefault((mark.kind, mark.name), [])
@@ -173,7 +183,7 @@ def _labels(robot: Robot, data: Any, seen_from: View, marks: Sequence[Mark]) -> 
         place = place_of(robot, data, kind, name)
         if place is None:
             continue
-        # A bare name is a joint's.
+        # A name without a kind is a joint's.
         title = name if kind == "joint" else f"{kind} {name}"
         texts = [line[:MOST_LETTERS] for line in (title, *lines)]
         lines = [line for text in texts for line in break_name(text, LETTERS).split("\n")]
@@ -183,12 +193,13 @@ def _labels(robot: Robot, data: Any, seen_from: View, marks: Sequence[Mark]) -> 
 
 
 def _sides(labels: Sequence[_Label]) -> tuple[list[_Label], list[_Label]]:
-    """Labels for the left and for the right column, from above to below: on the side on which their
-    places lie, as long as there is room.
+    """Divide labels between the left and the right column, each from top to bottom.
+
+    Each label is on the side of its place, as long as there is space.
     """
     across = sorted(labels, key=lambda label: (label.point[0], -label.point[1]))
     count = sum(label.point[0] < 0 for label in across)
-    # A column is no longer than the drawing, unless both are.
+    # A column is not longer than the drawing, unless both columns are.
     while count and _height(across[:count]) > max(LONGEST, _height(across[count:])):
         count -= 1
     while count < len(across) and _height(across[count:]) > max(LONGEST, _height(across[:count])):
@@ -201,7 +212,7 @@ def _height(labels: Sequence[_Label]) -> float:
 
 
 def _breadth(labels: Sequence[_Label]) -> float:
-    """Inches of a column: room for its longest line, and for what leads to the place."""
+    """Return the width of a column in inches: its longest line and the connecting line."""
     if not labels:
         return 0.3
     longest = max(len(line) for label in labels for line in label.lines)
@@ -213,14 +224,15 @@ def _downwards(labels: Sequence[_Label]) -> list[_Label]:
 
 
 def heights_of(wanted: Sequence[float], sizes: Sequence[float], low: float, high: float) -> Array:
-    """(N,) middles of labels that do not overlap, as near to those wanted as a pass in each
-    direction brings them.
+    """Compute (N,) middles of labels that do not overlap, close to the wanted ones.
+
+    One pass in each direction moves the labels apart.
 
     Args:
-        wanted: (N,) their middles, from above to below.
-        sizes: (N,) their heights.
-        low: where the column ends.
-        high: where it begins; it holds them all.
+        wanted: (N,) wanted middles, from top to bottom.
+        sizes: (N,) heights of the labels.
+        low: Lower end of the column.
+        high: Upper end of the column, which has space for all labels.
     """
     middles = np.array(wanted, dtype=np.float64)
     ceiling = high
@@ -235,7 +247,10 @@ def heights_of(wanted: Sequence[float], sizes: Sequence[float], low: float, high
 
 
 def _write(axis: Axes, labels: Sequence[_Label], x: float, scale: float, tall: float) -> None:
-    """A column of labels at `x` metres; `scale` is inches a metre, `tall` the column in inches."""
+    """Write a column of labels at `x` metres.
+
+    `scale` is in inches per metre, `tall` is the height of the column in inches.
+    """
     sizes = [label.height / scale for label in labels]
     half = tall / scale / 2
     middles = heights_of([label.point[1] for label in labels], sizes, -half, half)
@@ -264,7 +279,7 @@ def _write(axis: Axes, labels: Sequence[_Label], x: float, scale: float, tall: f
 
 
 def _mark(axis: Axes, robot: Robot, data: Any, seen_from: View, marks: Sequence[Mark]) -> None:
-    """Rings about places: whole where it is sure, dashed where it may be another."""
+    """Draw rings around places: solid if the place is certain, dashed otherwise."""
     sure: dict[tuple[str, str], bool] = {}
     for mark in marks:
         key = mark.kind, mark.name
@@ -275,7 +290,7 @@ def _mark(axis: Axes, robot: Robot, data: Any, seen_from: View, marks: Sequence[
             continue
         shape, size = _SIZES.get(kind, _SIZES["joint"])
         across, up = seen_from.seen(place[None])[0].tolist()
-        # Markers have no dashes of their own: a ring is a scatter of one point.
+        # Markers cannot be dashed, so a ring is a scatter plot of one point.
         axis.scatter(
             across,
             up,
@@ -291,7 +306,7 @@ def _mark(axis: Axes, robot: Robot, data: Any, seen_from: View, marks: Sequence[
 
 
 def _scale(axis: Axes, seen_from: View, scale: float, tall: float) -> None:
-    """A bar of so many metres, below to the left."""
+    """Draw a scale bar below the drawing, at the left."""
     length = round_length(0.3 * seen_from.width)
     left = -seen_from.width / 2
     y = -tall / scale / 2 - 0.2 / scale
@@ -309,6 +324,6 @@ def _scale(axis: Axes, seen_from: View, scale: float, tall: float) -> None:
 
 
 def round_length(most: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above `most` metres."""
+    """Return the largest of 1, 2, 5 times a power of ten that is at most `most`, in metres."""
     power = 10.0 ** np.floor(np.log10(most))
     return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most))

@@ -1,6 +1,4 @@
-"""Figures of the statistics: runtime distributions, amortised training, who wins at which cost,
-mean ranks.
-"""
+"""Draw runtime distributions, amortised training cost, cost of winning, and mean ranks."""
 
 from __future__ import annotations
 
@@ -43,18 +41,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Prices = Mapping[str, Mapping[str, Price]]
-"""By range of targets, by tuner."""
+"""Cost of reaching a threshold, by range of targets and tuner."""
 _WIDE = 30.0
-"""Factor of cost over which a tuner must win for its name to fit above its part of the strip."""
+"""Minimum ratio of the simulation costs over which a tuner wins for writing its name."""
 
 
 def runtime_figure(experiment: Experiment, style: Styles, statistics: Statistics) -> Figure:
-    """Share of (run, threshold) pairs that are reached, against simulations.
+    """Draw the share of (run, threshold) pairs that are reached, against simulations.
 
     Args:
-        experiment: what was compared.
-        style: of its tuners.
-        statistics: of it.
+        experiment: The experiment.
+        style: Styles of its tuners.
+        statistics: Its statistics.
     """
     spread, table = statistics.spread, statistics.shares
     ranges = list(dict.fromkeys(table["range"]))
@@ -64,7 +62,7 @@ def runtime_figure(experiment: Experiment, style: Styles, statistics: Statistics
         for tuner, line in table[table["range"] == kind].groupby("tuner", sort=False):
             points = line["simulations"].to_numpy()
             marks = np.flatnonzero(np.isin(points, checkpoints(budget))).tolist()
-            # Steps, not slopes: between two simulations nothing is reached.
+            # Steps, not slopes: no threshold is reached between two simulations.
             look = style.of(str(tuner))
             axis.step(points, line["share"], where="post", markevery=marks, markersize=4.5, **look)
         simulations_axis(axis, budget)
@@ -77,7 +75,7 @@ def runtime_figure(experiment: Experiment, style: Styles, statistics: Statistics
 
 
 def spread_caption(spread: Array) -> str:
-    """How a runtime distribution over these thresholds is read."""
+    """Return a caption that explains a runtime distribution over these thresholds."""
     span = f"from {spread[0]:.2g} to {spread[-1]:.2g} on a logarithmic scale"
     return (
         f"{len(spread)} thresholds {span}. "
@@ -89,16 +87,16 @@ def spread_caption(spread: Array) -> str:
 def amortisation_figure(
     experiment: Experiment, style: Styles, prices: Prices, level: float
 ) -> Figure:
-    """Number of targets from which on each training pays, against each tuner that searches.
+    """Draw from which number of targets on each training pays, against each searching tuner.
 
     Args:
-        experiment: what was compared.
-        style: of its tuners.
-        prices: of reaching `level`.
-        level: of the deciding metric.
+        experiment: The experiment.
+        style: Styles of its tuners.
+        prices: Cost of reaching `level`.
+        level: Threshold of the deciding metric.
     """
     searching, learning = break_even_sides(prices, style)
-    row = max(0.42, 0.14 * len(learning))  # inches
+    row = max(0.42, 0.14 * len(learning))  # Inches.
     size = (2.8 + 3.9 * len(prices), 1.7 + row * max(len(searching), 3))
     figure, grid = blank(1, len(prices), size, sharey=True)
     axes = list(grid[0])
@@ -131,8 +129,14 @@ def amortisation_figure(
 
 
 def break_even_sides(prices: Prices, style: Styles) -> tuple[list[str], list[str]]:
-    """Tuners that search, and trained ones that reach the error anywhere; each in the order of the
-    ranking.
+    """List the searching tuners, and the trained ones that reach the error in some range.
+
+    Args:
+        prices: Cost of reaching the error.
+        style: Styles of the tuners.
+
+    Returns:
+        Two lists, each in the order of the ranking.
     """
     found: dict[str, list[Price]] = {}
     for by_tuner in prices.values():
@@ -147,7 +151,7 @@ def break_even_sides(prices: Prices, style: Styles) -> tuple[list[str], list[str
 def _break_even(
     axis: Axes, table: pd.DataFrame, searching: Sequence[str], shift: float, look: dict[str, Any]
 ) -> None:
-    """One trained tuner's mark and interval in the row of each tuner that searches."""
+    """Draw one trained tuner's marker and interval in the row of each searching tuner."""
     rows = np.array([searching.index(str(t)) for t in table["search"]]) + shift
     middle = table["targets"].to_numpy()
     ends = np.array([middle - table["low"], table["high"] - middle])
@@ -156,8 +160,15 @@ def _break_even(
 
 
 def cost_figure(experiment: Experiment, style: Styles, prices: Prices, level: float) -> Figure:
-    """Seconds a target against the cost of a simulation; a strip below names who needs the least.
-    Arguments as of `amortisation_figure`.
+    """Draw seconds per target against the cost of a simulation.
+
+    A strip below names the tuner that needs the least time.
+
+    Args:
+        experiment: The experiment.
+        style: Styles of its tuners.
+        prices: Cost of reaching `level`.
+        level: Threshold of the deciding metric.
     """
     figure, axes = canvas(len(prices))
     table = seconds_table(prices)
@@ -181,7 +192,7 @@ def cost_figure(experiment: Experiment, style: Styles, prices: Prices, level: fl
 
 
 def _strip(axis: Axes, prices: Mapping[str, Price], style: Styles) -> None:
-    """Who needs the least time at each cost, as a coloured strip at the foot of a panel."""
+    """Draw the tuner with the least time at each cost as a coloured strip at the bottom."""
     for low, high, tuner in winners(prices, SHARED):
         colour = style.of(tuner)["color"]
         axis.axvspan(low, high, ymin=0.0, ymax=0.035, color=colour, linewidth=0)
@@ -197,19 +208,21 @@ def _strip(axis: Axes, prices: Mapping[str, Price], style: Styles) -> None:
 
 
 def rank_figure(ranked: pd.DataFrame, p_values: pd.DataFrame, friedman: float) -> Figure:
-    """Critical-difference diagram: mean ranks over problems, bars join what cannot be told apart at
-    5 %.
+    """Draw the critical-difference diagram: mean ranks over problems.
+
+    Bars join tuners that do not differ significantly at 5 %.
 
     Args:
-        ranked: ranks, a row a problem, a column a tuner.
-        p_values: Nemenyi's, of each pair of tuners.
-        friedman: p-value of Friedman's test.
+        ranked: Ranks, one row per problem, one column per tuner.
+        p_values: P-values of Nemenyi's test of each pair of tuners.
+        friedman: P-value of Friedman's test.
     """
     from scikit_posthocs import critical_difference_diagram
 
     figure, axes = blank(1, 1, (8.5, 1.6 + 0.28 * ranked.shape[1]))
     axis = axes[0, 0]
-    # Each tuner in the colour that it has in every other figure; a light one would be no text.
+    # Each tuner has its colour of every other figure; text stays dark, since light colours are hard
+    # to read.
     colours = {str(name): colour(place) for place, name in enumerate(ranked.columns)}
     drawn = critical_difference_diagram(
         ranked.mean(axis=0), p_values, ax=axis, label_props={"fontsize": 9}, color_palette=colours
@@ -224,12 +237,12 @@ def rank_figure(ranked: pd.DataFrame, p_values: pd.DataFrame, friedman: float) -
 def joint_runtime_figure(
     experiment: Experiment, style: Styles, shares: Mapping[str, Array]
 ) -> Figure:
-    """Runtime distributions over all problems.
+    """Draw runtime distributions over all problems.
 
     Args:
-        experiment: stands for all of them.
-        style: of their tuners.
-        shares: by tuner, reached after 0, 1, 2, ... hundredths of each problem's budget.
+        experiment: An experiment that represents all of them.
+        style: Styles of their tuners.
+        shares: By tuner, the share reached after 0, 1, 2, ... hundredths of each problem's budget.
     """
     figure, axes = canvas(1)
     axis = axes[0]

@@ -1,8 +1,8 @@
-"""How figures look and how they are saved: palette, markers, canvas, legend, files.
+"""Style and output of all figures: palette, markers, canvas, legend, files.
 
-Made for print: every tuner has its own marker and line style beside its colour, colours differ in
-lightness. No figure here is made by pyplot: a notebook's backend, settings and open figures stay as
-they are.
+The style is made for print: every tuner has its own marker and line style in addition to its
+colour, and colours differ in lightness. No figure is made by pyplot, so that a notebook's backend,
+settings and open figures are unchanged.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from bench.analysis.statistics import Statistics
     from bench.store.reference import Reference
 
-# Okabe and Ito's eight colours, safe for colour-blind readers: M. Okabe, K. Ito, Color Universal
-# Design, 2002.
+# Palette of eight colours safe for colour-blind readers: M. Okabe, K. Ito, Color Universal Design,
+# 2002.
 BLACK = "#000000"
 ORANGE = "#E69F00"
 BLUE = "#0072B2"
@@ -40,41 +40,41 @@ VERMILION = "#D55E00"
 GREEN = "#009E73"
 PURPLE = "#CC79A7"
 
-# Further ones where eight do not suffice, apart from the others in lightness.
+# Further colours if eight are not enough; they differ from the others in lightness.
 GREY = "#7F7F7F"
 VIOLET = "#5B3A8E"
 BROWN = "#A6761D"
 RUST = "#A03C00"
 PALE_BLUE = "#DCEBF5"
-"""Where a drive moves ahead."""
+"""Background where a drive moves forwards."""
 PALE_RUST = "#FBE6DA"
-"""Where it moves back."""
+"""Background where a drive moves backwards."""
 
-# Greys by what they are for, from dark to light.
+# Greys by their use, from dark to light.
 INK = "#333333"
-"""Marks that belong to no tuner."""
+"""Colour of marks that belong to no tuner."""
 SOFT = "#444444"
-"""Captions, and lines at a threshold."""
+"""Colour of captions, and of lines at a threshold."""
 ZERO = "#555555"
-"""The line at zero of a residual."""
+"""Colour of the zero line of a residual."""
 APART = "#888888"
-"""Lines between runs."""
+"""Colour of lines between runs."""
 JOIN = "#999999"
-"""Lines that join what belongs together."""
+"""Colour of lines that join related marks."""
 CHANCE = "#A8A8A8"
-"""Bars over what chance alone gives."""
+"""Colour of bars over the range expected under the null hypothesis."""
 SLOPE = "#BBBBBB"
-"""The incline of a bounce shot."""
+"""Colour of the incline of a bounce shot."""
 BAND = "#CFCFCF"
-"""What noise alone gives, and what is not needed."""
+"""Colour of bands of noise, and of parts that are not needed."""
 BEHIND = ("#9C9C9C", "#C2C2C2")
-"""Reference results behind one's own: the first, and a second."""
+"""Colours of the first and the second reference result behind the user's own."""
 GROUND = "#E4E4E4"
-"""Behind held-out runs."""
+"""Background of held-out runs."""
 SHADE = "#EEEEEE"
-"""Behind the part of a film that is recorded."""
+"""Background of the recorded part of a film, and of errors that count as equal."""
 
-# Dark and light in turn, so that neighbours differ in grey too.
+# Dark and light colours alternate, so that neighbours differ in greyscale, too.
 _COLOURS = (BLACK, ORANGE, BLUE, SKY, VERMILION, GREEN, PURPLE, GREY, VIOLET, BROWN)
 
 _DARK = {
@@ -89,11 +89,11 @@ _DARK = {
     VIOLET: "#B08CF0",
     BROWN: "#C4934A",
 }
-"""The same colours on a dark page, each three to one against it at least."""
+"""Colours for a dark page by colour for a light page, each with a contrast of at least 3 to 1."""
 
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
 
-# Eight against ten colours: the pairs repeat only after forty tuners.
+# Eight line styles against ten colours: the pairs repeat only after forty tuners.
 _LINES = (
     "-",
     "--",
@@ -106,29 +106,29 @@ _LINES = (
 )
 
 _LONG = re.compile(rb"\b[1-9]\d*\.\d{3,}\b")
-"""A number of an SVG file with more digits than it needs; those below 1 are scales."""
+"""Pattern of a number in an SVG file with needless digits; numbers below 1 are scales."""
 
 _DASHES: dict[Any, tuple[float, ...]] = {"-": (), "--": (3.7, 1.6), "-.": (6.4, 1.6, 1.0, 1.6)}
-"""Matplotlib's named lines, in widths of the line."""
+"""Dashes of Matplotlib's named line styles, in line widths."""
 
 
 def colour(place: int) -> str:
-    """Of the tuner or diagnoser at this place."""
+    """Return the colour of the tuner or diagnoser at this index."""
     return _COLOURS[place % len(_COLOURS)]
 
 
 def marker(place: int) -> str:
-    """Likewise."""
+    """Return the marker of the tuner or diagnoser at this index."""
     return _marker(place)
 
 
 def line(place: int) -> Any:
-    """Likewise, its style."""
+    """Return the line style of the tuner or diagnoser at this index."""
     return _LINES[place % len(_LINES)]
 
 
 DPI = 160
-"""Dots an inch of the PNG files."""
+"""Resolution of the PNG files in dots per inch."""
 
 CAPTION = (
     "Line: median over targets of the recommendation's error (mean over seeds). "
@@ -143,17 +143,17 @@ TITLES = {
     "obs_error": "Runs tuned on",
     "heldout_error": "Held-out runs, open loop",
 }
-"""What a panel shows: a range of targets, or runs of a recording."""
+"""Panel titles: ranges of targets, or kinds of runs of a recording."""
 
 
 class Look(NamedTuple):
-    """How a page draws what belongs to one name.
+    """Style of a name's marks on a page.
 
     Attributes:
-        colour: on a light ground.
-        dark: on a dark ground.
-        dashes: lengths drawn and left out in turn, in widths of the line; empty for a whole line.
-        marker: by matplotlib's letter; empty for none.
+        colour: Colour on a light background.
+        dark: Colour on a dark background.
+        dashes: Lengths of dashes and gaps in turn, in line widths; empty for a solid line.
+        marker: Matplotlib's letter of the marker; empty for none.
     """
 
     colour: str
@@ -163,31 +163,37 @@ class Look(NamedTuple):
 
 
 def _marker(place: int) -> str:
-    """The marker at a place: each round of colours meets other ones."""
+    """Return the marker at an index; it is combined with another colour in each round."""
     rounds = place // len(_COLOURS)
     return _MARKERS[(place + 3 * rounds) % len(_MARKERS)]
 
 
 def look(place: int) -> Look:
-    """The look of what stands at a place of a list, apart from its neighbours in grey too."""
+    """Return the style at an index of a list; neighbours differ in greyscale, too."""
     colour, line = _COLOURS[place % len(_COLOURS)], _LINES[place % len(_LINES)]
     dashes = _DASHES[line] if isinstance(line, str) else tuple(map(float, line[1]))
     return Look(colour, _DARK[colour], dashes, _marker(place))
 
 
 def drawn(colour: str, dashes: tuple[float, ...] = (), marker: str = "") -> Look:
-    """The look of what has a colour of the palette by what it is."""
+    """Return the style for a colour of the palette.
+
+    Args:
+        colour: A colour of the palette that has a dark variant.
+        dashes: As in `Look`.
+        marker: As in `Look`.
+    """
     return Look(colour, _DARK[colour], dashes, marker)
 
 
 class Styles:
-    """Colour, marker and line of each tuner, fixed by its place in the experiment.
+    """Colour, marker and line of each tuner, fixed by its index in the experiment.
 
     Args:
-        experiment: what was compared.
-        order: tuners that have runs, as the legend lists them: the best first.
-        behind: reference results that curves are drawn in front of; `BEHIND` of them at most.
-        notes: what the legend says below a tuner's name.
+        experiment: The experiment.
+        order: Tuners that have runs, in the order of the legend: best first.
+        behind: Reference results drawn behind the curves; at most as many as `BEHIND` has colours.
+        notes: Text of the legend below a tuner's name.
     """
 
     def __init__(
@@ -199,12 +205,12 @@ class Styles:
     ) -> None:
         self.experiment, self.behind, self.notes = experiment, behind, notes or {}
         present = set(order)
-        # A place counts tuners that did not run too: a colour means the same in every figure.
+        # Tuners without runs count, too, so that a colour means the same tuner in every figure.
         self._places = {e.label: i for i, e in enumerate(experiment.tuners) if e.label in present}
         self.order = [label for label in order if label in self._places]
 
     def of(self, tuner: str) -> dict[str, Any]:
-        """Keyword arguments for plotting `tuner`."""
+        """Return keyword arguments for plotting `tuner`."""
         i = self._places[tuner]
         return {
             "color": _COLOURS[i % len(_COLOURS)],
@@ -215,14 +221,20 @@ class Styles:
         }
 
     def look(self, tuner: str) -> Look:
-        """The same for a page."""
+        """Return the style of `tuner` on a page."""
         return look(self._places[tuner])
 
     def grey(self, reference: Reference, tuner: str) -> dict[str, Any]:
-        """Keyword arguments for plotting `tuner` of a reference: grey and thin, with the marker and
-        line that it has among the user's own.
+        """Return keyword arguments for plotting `tuner` of a reference.
+
+        The line is grey and thin, with the marker and line style of the user's own tuner of that
+        name.
+
+        Args:
+            reference: The reference result.
+            tuner: Label of the tuner.
         """
-        # Those that the user does not have take the places behind.
+        # Tuners that the user does not have get the following indices.
         others = [each for each in reference.tuners if each not in self._places]
         taken = 1 + max(self._places.values(), default=-1)
         i = self._places[tuner] if tuner in self._places else taken + others.index(tuner)
@@ -237,7 +249,7 @@ class Styles:
         }
 
     def offset(self, tuner: str) -> float:
-        """A small shift along a category axis, so that error bars stand beside each other."""
+        """Return a small shift along a category axis that places error bars side by side."""
         return (self._places[tuner] - (len(self._places) - 1) / 2) * 0.6 / max(len(self._places), 1)
 
 
@@ -247,13 +259,13 @@ def style_of(
     behind: Sequence[Reference] = (),
     shown: Sequence[tuple[str, str]] = (),
 ) -> Styles:
-    """Return the looks of a comparison's tuners, in the order of its ranking.
+    """Return the styles of a comparison's tuners, in the order of its ranking.
 
     Args:
-        experiment: what was compared.
-        statistics: of it.
-        behind: reference results that curves are drawn in front of.
-        shown: metric and range of each panel of curves against simulations; the legend says which
+        experiment: The experiment.
+        statistics: Its statistics.
+        behind: Reference results drawn behind the curves.
+        shown: Metric and range of each panel of curves against simulations; the legend says which
             curves coincide in them.
     """
     notes = [statistics.notes, statistics.coinciding(shown)]
@@ -268,14 +280,14 @@ def blank(
     layout: Any = "constrained",
     **options: Any,
 ) -> tuple[Figure, Any]:
-    """A figure and its (rows, columns) panels, unknown to pyplot.
+    """Make a figure and its (rows, columns) panels without pyplot.
 
     Args:
-        rows: of panels.
-        columns: of panels.
-        size: width and height in inches.
-        layout: matplotlib's layout engine; None where the margins are set by hand.
-        **options: of `matplotlib.figure.Figure.subplots`.
+        rows: Number of rows of panels.
+        columns: Number of columns of panels.
+        size: Width and height in inches.
+        layout: Matplotlib's layout engine; None if the margins are set by hand.
+        **options: Options of `matplotlib.figure.Figure.subplots`.
     """
     # Matplotlib takes most of a second to load, and most commands draw nothing.
     from bench.figures.picture import Picture
@@ -285,7 +297,7 @@ def blank(
 
 
 def canvas(panels: int) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels side by side, which share their vertical axis."""
+    """Make a figure with panels side by side that share their vertical axis."""
     figure, axes = blank(1, panels, (1.2 + 4.3 * panels, 4.6), sharey=True)
     for axis in axes[0]:
         plain(axis)
@@ -293,13 +305,13 @@ def canvas(panels: int) -> tuple[Figure, list[Axes]]:
 
 
 def titled(axis: Axes, title: str) -> None:
-    """A title above a panel that has no ticks there."""
-    # Where its place is left open, every drawing measures all ticks for it.
+    """Set a title above a panel that has no ticks there."""
+    # Without a fixed position, every drawing measures all ticks for the title.
     axis.set_title(title, fontsize=10, y=1.0)
 
 
 def plain(axis: Axes) -> None:
-    """A faint grid, and no frame above and to the right."""
+    """Draw a faint grid, and remove the frame at the top and right."""
     axis.grid(visible=True, which="major", linewidth=0.4, alpha=0.5)
     axis.spines[["top", "right"]].set_visible(False)
 
@@ -312,9 +324,18 @@ def finish(
     caption: str = CAPTION,
     heading: str = "best over all targets first",
 ) -> None:
-    """Legend, title and caption."""
+    """Add legend, title and caption to a figure.
+
+    Args:
+        figure: The figure.
+        axes: Its panels.
+        style: Styles of the tuners.
+        experiment: The experiment, which gives the title.
+        caption: Caption below the figure.
+        heading: Title of the legend.
+    """
     handles: dict[str, Any] = {}
-    # A panel may lack a tuner that another has; of those in both, the first panel's is shown.
+    # A panel may lack a tuner that another panel has; of several handles the first panel's is used.
     for axis in reversed(axes):
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
     listed = [
@@ -344,13 +365,13 @@ def finish(
 
 
 _ROWS = 18
-"""Of a legend in letters of the usual size."""
+"""Maximum number of legend entries in letters of the normal size."""
 
 
 def _behind_entries(
     axes: list[Axes], style: Styles, reference: Reference
 ) -> list[tuple[Line2D, str]]:
-    """What a legend lists of a reference: a heading, and its tuners that are drawn."""
+    """Make the legend entries of a reference: a heading, and its tuners that are drawn."""
     from matplotlib.lines import Line2D
 
     drawn = {line.get_gid() for axis in axes for line in axis.get_lines()}
@@ -372,22 +393,22 @@ def _behind_caption(reference: Reference, experiment: Experiment) -> str:
 
 
 def behind_id(reference: Reference, tuner: str) -> str:
-    """By which a reference's line is known in a figure."""
+    """Return the identifier of a reference's line in a figure."""
     return f"behind {reference.name} {tuner}"
 
 
 def below(figure: Figure, caption: str, letters: int) -> None:
-    """A caption under the figure, in lines of so many letters for each inch of its width."""
+    """Add a caption below a figure, with `letters` characters per inch of its width."""
     lines = textwrap.fill(caption, int(letters * figure.get_figwidth()))
     figure.supxlabel(lines, fontsize=7.5, color=SOFT)
 
 
 TRUSTED = "trusted: the tuners ran inside the harness, where nothing is out of their reach"
-"""What is said of runs whose tuners were not sealed."""
+"""Warning for results whose tuners were not isolated."""
 
 
 def mark(figure: Figure, trusted: bool) -> Figure:
-    """The figure, with a word in its title and a sentence below where its tuners were trusted."""
+    """Mark a figure in its title and caption if its tuners were not isolated, and return it."""
     if trusted:
         figure.suptitle(f"{figure.get_suptitle()} (trusted)", fontsize=11)
         below(figure, f"{TRUSTED.capitalize()}. {figure.get_supxlabel()}", letters=17)
@@ -405,40 +426,41 @@ class _Pixels(BytesIO):
     """The pixels of a figure as Matplotlib's renderer writes them.
 
     Attributes:
-        shape: height and width; the renderer alone knows how it rounds them.
+        shape: Height and width as rounded by the renderer.
     """
 
     shape: tuple[int, int] = (0, 0)
 
     def write(self, pixels: Any) -> int:
-        """Keep the pixels (H, W, 4) that are written at once."""
+        """Store the pixels (H, W, 4), which are written in one call."""
         height, width, _ = memoryview(pixels).shape or (0, 0, 0)
         self.shape = height, width
         return super().write(pixels)
 
 
 def pdf(figure: Figure) -> bytes:
-    """A figure as the bytes of a PDF file."""
+    """Render a figure as the bytes of a PDF file."""
     file = BytesIO()
-    # Without its date a file is the same whenever it is made.
+    # Without a date the file is identical whenever it is made.
     figure.savefig(file, format="pdf", metadata={"CreationDate": None})
     return file.getvalue()
 
 
 def svg(figure: Figure) -> bytes:
-    """A figure as the bytes of an SVG file."""
+    """Render a figure as the bytes of an SVG file."""
     from matplotlib import rc_context
 
     file = BytesIO()
-    # Without a date and chance names a file is the same whenever it is made.
+    # Without a date and random names the file is identical whenever it is made.
     with rc_context({"svg.hashsalt": "simgap"}):
         figure.savefig(file, format="svg", metadata={"Date": None})
-    # A hundredth of a point is less than any printer shows, and half of the file.
+    # A hundredth of a point is finer than any printer's resolution; longer numbers would double the
+    # size.
     return _LONG.sub(lambda match: f"{float(match[0]):.2f}".encode(), file.getvalue())
 
 
 def printed(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | None]:
-    """Render a figure as PNG, and as PDF where one is asked for (`bench.figures.formats`).
+    """Render a figure as PNG, and as PDF if requested (`bench.figures.formats`).
 
     Returns:
         The bytes of the PNG file, and those of the PDF file or None.
@@ -448,13 +470,13 @@ def printed(figure: Figure, dpi: int = DPI) -> tuple[bytes, bytes | None]:
 
 
 def taken(figure: Figure, dpi: int = DPI) -> Pictures:
-    """Render a figure as PNG, as SVG for a page, and as PDF where one is asked for."""
+    """Render a figure as PNG, as SVG for a page, and as PDF if requested."""
     with _laid_out_once(figure, dpi):
         return Pictures(png(figure, dpi), svg(figure), _asked_pdf(figure))
 
 
 class Pictures(NamedTuple):
-    """One figure as the bytes of its files; `pdf` is None where no PDF is asked for."""
+    """One figure as the bytes of its files; `pdf` is None if no PDF is requested."""
 
     png: bytes
     svg: bytes
@@ -467,7 +489,7 @@ def _asked_pdf(figure: Figure) -> bytes | None:
 
 @contextmanager
 def _laid_out_once(figure: Figure, dpi: int) -> Iterator[None]:
-    """Run the layout engine once, for all files that are written inside the context."""
+    """Context that runs the layout engine once for all files written inside it."""
     engine, screen = figure.get_layout_engine(), figure.dpi
     try:
         if engine is not None:
@@ -483,26 +505,38 @@ def _laid_out_once(figure: Figure, dpi: int) -> Iterator[None]:
 
 
 def save(figure: Figure, path: Path, dpi: int = DPI) -> list[Path]:
-    """Write a figure as PNG, and as PDF where one is asked for: all files or none.
+    """Write a figure as PNG, and as PDF if requested: all files or none.
 
     Missing folders are made.
 
     Args:
-        figure: what to write.
-        path: of the files without their endings.
-        dpi: dots an inch of the PNG.
+        figure: Figure to write.
+        path: Path of the files without file extension.
+        dpi: Resolution of the PNG in dots per inch.
 
     Returns:
-        The files, the PNG first.
+        Paths of the files, the PNG first.
 
     Raises:
-        InputError: the folder cannot be made or written to.
+        InputError: The folder cannot be made or written to.
     """
     return keep(path, *printed(figure, dpi))
 
 
 def keep(path: Path, as_png: bytes, as_pdf: bytes | None) -> list[Path]:
-    """Write a figure's files, all or none; returns and raises as `save`."""
+    """Write a figure's files, all or none.
+
+    Args:
+        path: Path of the files without file extension.
+        as_png: Content of the PNG file.
+        as_pdf: Content of the PDF file; None for no such file.
+
+    Returns:
+        Paths of the files, the PNG first.
+
+    Raises:
+        InputError: The folder cannot be made or written to.
+    """
     contents = {path.with_name(f"{path.name}.png"): as_png}
     if as_pdf is not None:
         contents[path.with_name(f"{path.name}.pdf")] = as_pdf

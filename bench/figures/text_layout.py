@@ -1,4 +1,4 @@
-"""How much room texts take, and where long names are broken into lines."""
+"""Measure texts, and break long names into lines."""
 
 from __future__ import annotations
 
@@ -7,29 +7,41 @@ import textwrap
 from collections.abc import Sequence
 
 POINTS = 72.0
-"""Points in an inch."""
+"""Number of points in an inch."""
 
 
 def break_name(name: str, longest: int) -> str:
-    """Break a name into lines of at most `longest` characters, behind underscores and the like
-    where possible, and never within the brackets of a unit.
+    """Break a name into lines of at most `longest` characters.
+
+    Lines end after underscores and similar characters if possible, and never within the brackets of
+    a unit.
+
+    Args:
+        name: Name to break.
+        longest: Maximum length of a line.
     """
     parts = []
     for bracketed, free in re.findall(r"(\[[^\]]*\]\s*)|([^\[]+|\[)", name):
-        # Not behind the point of a number.
+        # Do not break after a decimal point.
         parts += [bracketed] if bracketed else re.split(r"(?<=[_\-/ ])|(?<=\.)(?!\d)", free)
     lines = [""]
     for part in parts:
         if lines[-1] and len(lines[-1]) + len(part.rstrip()) > longest:
             lines.append("")
         lines[-1] += part
-    # A part may be too long by itself.
+    # A part may be too long even for a line of its own.
     return "\n".join(piece for line in lines for piece in textwrap.wrap(line, longest))
 
 
 def brief(name: str, most: int) -> str:
-    """Shorten the name of a quantity of a joint to the quantity, if it has more than `most`
-    characters: ``velocity of elbow`` to ``velocity``, ``u.elbow`` to ``u``.
+    """Shorten a long name of a joint's quantity to the quantity.
+
+    Names with more than `most` characters are shortened, such as ``velocity of elbow`` to
+    ``velocity`` and ``u.elbow`` to ``u``.
+
+    Args:
+        name: Name to shorten.
+        most: Maximum length.
     """
     return name if len(name) <= most else re.split(r" of |\.", name, maxsplit=1)[0][:most]
 
@@ -38,8 +50,8 @@ def text_width(texts: Sequence[str], size: float, weight: str = "normal") -> flo
     """Return the width of the longest line of some texts, in inches.
 
     Args:
-        texts: each of one or several lines.
-        size: of the letters, in points.
+        texts: Texts of one or several lines.
+        size: Size of the letters in points.
         weight: ``normal`` or ``bold``.
     """
     from matplotlib.font_manager import FontProperties
@@ -52,5 +64,5 @@ def text_width(texts: Sequence[str], size: float, weight: str = "normal") -> flo
 
 
 def most_lines(texts: Sequence[str]) -> int:
-    """Return the number of lines of the text that has most."""
+    """Return the maximum number of lines of the texts."""
     return max((text.count("\n") + 1 for text in texts), default=1)

@@ -1,4 +1,4 @@
-"""The picture of a track: where the ball was seen, over the scene, and its height over time."""
+"""Draw a ball track: the detected positions in the scene, and its height over time."""
 
 from __future__ import annotations
 
@@ -17,28 +17,33 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHOWN = 6
-"""Outlines of the ball that are drawn, spread over its way."""
+"""Number of ball outlines that are drawn, evenly spaced along its path."""
 _DPI = 140
 _SEEN = BLUE
 _MISSING = RUST
 
 
 def drawn(track: Track, heights: Heights, part: slice, title: str) -> tuple[bytes, bytes | None]:
-    """Render the figure of a track as PNG, and as PDF where one is asked for; arguments as of
-    `track_figure`.
+    """Render the figure of a track as PNG, and as PDF if requested.
+
+    Args:
+        track: Track of the ball, px.
+        heights: Heights of its centre, m.
+        part: Frames that are recorded.
+        title: Title above the figure.
     """
     figure = track_figure(track, heights, part, title)
     return printed(figure, _DPI)
 
 
 def track_figure(track: Track, heights: Heights, part: slice, title: str) -> Figure:
-    """The track over the scene, and height and radius over time.
+    """Draw the track in the scene, and height and radius over time.
 
     Args:
-        track: of the ball, px.
-        heights: of its centre, m.
-        part: the frames that are recorded.
-        title: above the figure.
+        track: Track of the ball, px.
+        heights: Heights of its centre, m.
+        part: Frames that are recorded.
+        title: Title above the figure.
     """
     figure, axes = blank(1, 3, (13, 4.3), gridspec_kw={"width_ratios": (1, 1.2, 1.2)})
     scene, above, below = axes[0]
@@ -49,13 +54,13 @@ def track_figure(track: Track, heights: Heights, part: slice, title: str) -> Fig
     above.set_title("dotted: ball on the ground", fontsize=9)
     below.set_title("grey: recorded; marks at the foot: no ball seen", fontsize=9)
     found, frames = int(np.isfinite(track.u).sum()), len(track.times)
-    # A film's name is no formula.
+    # A film's name must not be read as mathematics.
     figure.suptitle(f"{title}\n{found} of {frames} frames", parse_math=False, fontsize=10)
     return figure
 
 
 def _scene(axis: Axes, track: Track) -> None:
-    """The track over the background, with some outlines; white under each for dark scenes."""
+    """Draw the track on the background with some outlines, on white for dark scenes."""
     from matplotlib.patches import Circle
 
     axis.imshow(_overlaid(track), interpolation="nearest")
@@ -81,20 +86,20 @@ def _over_time(axis: Axes, track: Track, part: slice, values: Array, label: str)
 
 
 def _some(track: Track) -> list[int]:
-    """Numbers of a few frames with the ball, spread over its way."""
+    """Return the indices of a few frames with the ball, evenly spaced along its path."""
     seen = track.seen.tolist()
     steps = np.hypot(np.diff(track.u[seen]), np.diff(track.v[seen]))
     way = np.concatenate([[0.0], np.cumsum(steps)])
-    # Evenly along the way, not in time: outlines of a slow ball would cover each other.
+    # Evenly along the path, not in time: outlines of a slow ball would cover each other.
     places = np.searchsorted(way, np.linspace(0, way[-1], _SHOWN)).clip(0, len(seen) - 1)
     return [seen[i] for i in np.unique(places)]
 
 
 def _overlaid(track: Track) -> Image:
-    """The background with the balls of a few frames in it."""
+    """Return the background with the balls of a few frames copied into it."""
     picture = track.background.copy()
     v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
-    # Of each kept frame only the disc of the ball is laid over the scene.
+    # Only the disc of the ball is copied from each stored frame.
     for k, frame in track.pictures.items():
         if 0 <= k < len(track.u) and np.isfinite(track.u[k]):
             ball = np.hypot(u - track.u[k], v - track.v[k]) <= track.radius[k]

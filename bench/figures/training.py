@@ -1,4 +1,4 @@
-"""The figure of a training: loss against epoch, training and held-out."""
+"""Draw the figure of a training: training loss and held-out loss against epoch."""
 
 from __future__ import annotations
 
@@ -21,20 +21,28 @@ _STAGES = {"clean": "Network for targets without noise", "noisy": "Network for n
 
 
 def draw(folder: Path, title: str, rows: Sequence[Row]) -> Path:
-    """Draw the losses into `folder`/figures; returns the PNG.
+    """Draw the losses into `folder`/figures.
+
+    Args:
+        folder: Folder of the results.
+        title: Title above the figure.
+        rows: Losses of all epochs.
+
+    Returns:
+        Path of the PNG file.
 
     Raises:
-        InputError: the folder cannot be made or written to.
+        InputError: The folder cannot be made or written to.
     """
     return save(loss_figure(title, rows), folder / "figures" / "loss")[0]
 
 
 def loss_figure(title: str, rows: Sequence[Row]) -> Figure:
-    """Loss against epoch, a panel a stage.
+    """Draw loss against epoch, one panel per stage.
 
     Args:
-        title: above the figure.
-        rows: of all epochs.
+        title: Title above the figure.
+        rows: Losses of all epochs.
     """
     # In the order in which they were trained.
     stages = list(dict.fromkeys(row[1] for row in rows))
@@ -43,7 +51,7 @@ def loss_figure(title: str, rows: Sequence[Row]) -> Figure:
     for axis, stage in zip(axes[0], stages, strict=True):
         for seed in seeds:
             values = np.array([row[2:] for row in rows if row[:2] == (seed, stage)])
-            # The first seed speaks for all in the legend.
+            # The legend lists the lines of the first seed only.
             _lines(axis, values.T, named=seed == seeds[0])
         axis.set(
             title=_STAGES.get(stage, stage),
@@ -59,7 +67,7 @@ def loss_figure(title: str, rows: Sequence[Row]) -> Figure:
 
 
 def _lines(axis: Axes, values: Array, named: bool) -> None:
-    """One training: `values` are (3, epochs): epoch, training loss, held-out loss."""
+    """Draw one training; `values` are (3, epochs): epoch, training loss, held-out loss."""
     epochs, training, held_out = values
     for losses, line, colour, name in (
         (training, "-", BLUE, "training"),

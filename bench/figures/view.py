@@ -1,11 +1,11 @@
-"""Where the places of a robot are, and from where it is looked at: the plane that shows most of it.
+"""Choose the camera view of a robot that shows most of it, and locate its places.
 
-With f forward, r right and u up (unit vectors, orthogonal) and c the centre, a point p is seen,
-without perspective, at
+With f forward, r right and u up (orthogonal unit vectors) and c the centre, a point p is projected
+without perspective to
 
     ((p - c) . r, (p - c) . u)                                                     (1)
 
-so that a metre is as long everywhere in the picture.
+so that a metre has the same length everywhere in the picture.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from sims.robot.model import Robot
 
 AZIMUTHS = tuple(range(0, 360, 30))
-"""Degrees: the directions from which a robot in space is looked at in turn."""
+"""Azimuths in degrees that are tried for a robot that moves in space."""
 ELEVATION = -25.0
-"""Degrees: from a little above."""
+"""Elevation of the camera in degrees, slightly from above."""
 PARALLEL = 0.02
-"""Sine of the angle up to which two axes count as parallel."""
+"""Maximum sine of the angle between two axes that count as parallel."""
 AROUND = 0.3
-"""What does not move is shown up to this share of the robot's size around it."""
+"""Maximum distance around the robot at which static shapes are shown, relative to its size."""
 MARGIN = 0.06
-"""Empty ground to each side, as a share of what is shown."""
+"""Empty margin at each side, as a fraction of the displayed size."""
 LEAST = 0.02
-"""Metres that a picture shows at least."""
+"""Minimum width and height of a picture in metres."""
 SLIMMEST = 0.3
-"""A picture is at least this share of its other side wide or high: labels need room."""
+"""Minimum ratio of a picture's width to its height and vice versa, so that labels have space."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class View:
     """A parallel projection.
 
     Attributes:
-        azimuth, elevation: degrees, as MuJoCo's free camera counts them.
-        centre: (3,) metres, what is in the middle.
-        width, height: metres that are shown.
+        azimuth, elevation: Angles in degrees, by the convention of MuJoCo's free camera.
+        centre: (3,) point in the middle of the picture, in metres.
+        width, height: Displayed size in metres.
     """
 
     azimuth: float
@@ -55,12 +55,12 @@ class View:
 
     @property
     def axes(self) -> Array:
-        """(3, 3) rows: right, up, forward."""
+        """(3, 3) unit vectors in rows: right, up, forward."""
         return _axes(self.azimuth, self.elevation)
 
     def seen(self, points: Array) -> Array:
-        """(N, 2) metres from the middle to the right and up, of points (N, 3)."""
-        seen: Array = (np.asarray(points) - self.centre) @ self.axes[:2].T  # (1)
+        """Project points (N, 3) to (N, 2) metres to the right and up from the middle."""
+        seen: Array = (np.asarray(points) - self.centre) @ self.axes[:2].T  # Equation (1).
         return seen
 
 
@@ -72,8 +72,11 @@ def _axes(azimuth: float, elevation: float) -> Array:
 
 
 def posed(robot: Robot, positions: dict[str, float]) -> Any:
-    """The robot's mujoco.MjData at positions by joint (rad or m), as the file has it where none is
-    given.
+    """Compute the robot's mujoco.MjData at a pose.
+
+    Args:
+        robot: The robot.
+        positions: Positions by joint, rad or m; other joints keep the position of the model file.
     """
     import mujoco
 
@@ -86,8 +89,14 @@ def posed(robot: Robot, positions: dict[str, float]) -> Any:
 
 
 def view(robot: Robot, data: Any) -> View:
-    """Where to look from: along the common axis of a planar robot, else from where its joints lie
-    furthest apart.
+    """Choose the camera view of a robot.
+
+    The camera looks along the common axis of a planar robot, else from the direction in which its
+    joints are furthest apart.
+
+    Args:
+        robot: The robot.
+        data: MuJoCo data at the pose.
     """
     azimuth, elevation = _direction(robot, data)
     axes = _axes(azimuth, elevation)
@@ -95,7 +104,7 @@ def view(robot: Robot, data: Any) -> View:
     points = np.concatenate([data.xanchor, moving, _tips(robot.compiled, data)]) @ axes.T
     low, high = points.min(axis=0), points.max(axis=0)
     if len(still):
-        # A floor or a long rail would make the robot small.
+        # A floor or a long rail would make the robot too small.
         around = AROUND * float(np.linalg.norm(high - low))
         clipped = np.clip(still @ axes.T, low - around, high + around)
         low = np.minimum(low, clipped.min(axis=0))
@@ -106,8 +115,9 @@ def view(robot: Robot, data: Any) -> View:
 
 
 def _tips(model: Any, data: Any) -> Array:
-    """(N, 3) how far bodies without shapes are drawn that carry no other: as far behind their
-    centre of mass as that is from their joint.
+    """Return the (N, 3) drawn ends of bodies that have neither shapes nor child bodies.
+
+    The end is the body's joint mirrored at its centre of mass.
     """
     bare = set(range(1, model.nbody)) - {*model.geom_bodyid.tolist(), *model.body_parentid.tolist()}
     jointed = [body for body in sorted(bare) if int(model.body_jntadr[body]) >= 0]
@@ -116,14 +126,14 @@ def _tips(model: Any, data: Any) -> Array:
 
 
 def _direction(robot: Robot, data: Any) -> tuple[float, float]:
-    """Azimuth and elevation in degrees."""
+    """Return azimuth and elevation of the camera in degrees."""
     normal = _normal(robot, data)
     if normal is not None and abs(normal[2]) > 1 - PARALLEL:
         return 90.0, -90.0
     if normal is not None:
         azimuth = float(np.rad2deg(np.arctan2(normal[1], normal[0]))) % 360
         elevation = float(np.rad2deg(np.arcsin(np.clip(normal[2], -1, 1))))
-        # Of the two sides the one on which x runs to the right, as in a drawing.
+        # Of the two sides, use the one where x points to the right, as in a drawing.
         right = _axes(azimuth, elevation)[0]
         flipped = right @ (1.0, 1e-3, 0.0) < 0
         return ((azimuth + 180) % 360, -elevation) if flipped else (azimuth, elevation)
@@ -135,12 +145,13 @@ def _direction(robot: Robot, data: Any) -> tuple[float, float]:
         sizes = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
         return float(np.prod(sizes))
 
-    # Rounded, or a robot that looks the same from two sides would be turned by rounding.
+    # Without rounding, numerical errors would decide for a robot that looks the same from two
+    # sides.
     return max(AZIMUTHS, key=lambda azimuth: round(spread(azimuth), 9)), ELEVATION
 
 
 def _normal(robot: Robot, data: Any) -> Array | None:
-    """(3,) the normal of the plane in which a planar robot moves; None for any other."""
+    """Return (3,) the normal of the plane in which a planar robot moves; None for others."""
     if not all(joint.single for joint in robot.joints):
         return None
     hinges = [data.xaxis[j.id] for j in robot.joints if j.kind == "hinge"]
@@ -154,8 +165,16 @@ def _normal(robot: Robot, data: Any) -> Array | None:
 
 
 def outlines(model: Any, data: Any) -> tuple[Array, Array]:
-    """Corners (N, 3) and (M, 3) of boxes about the shapes of what moves and of what does not;
-    centres of mass stand for bodies without shapes.
+    """Compute the corners of bounding boxes of moving and of static shapes.
+
+    Centres of mass represent bodies without shapes.
+
+    Args:
+        model: mujoco.MjModel.
+        data: MuJoCo data at the pose.
+
+    Returns:
+        (N, 3) corners of moving shapes and (M, 3) of static ones.
     """
     import mujoco
 
@@ -183,7 +202,17 @@ def _still(model: Any, body: int) -> bool:
 
 
 def place_of(robot: Robot, data: Any, kind: str, name: str) -> Array | None:
-    """(3,) metres, where a place of the robot is; None where the robot has no such place."""
+    """Return (3,) the position of a place of the robot in metres.
+
+    Args:
+        robot: The robot.
+        data: MuJoCo data at the pose.
+        kind: ``joint``, ``actuator``, ``body`` or ``channel``.
+        name: Name of the place.
+
+    Returns:
+        The position; None if the robot has no such place.
+    """
     try:
         if kind == "body":
             return np.array(data.xipos[robot.body(name).id])
@@ -198,7 +227,7 @@ def place_of(robot: Robot, data: Any, kind: str, name: str) -> Array | None:
 
 
 def _place_of_channel(robot: Robot, data: Any, name: str) -> Array | None:
-    """Of a joint's channel the joint, of a sensor what it is fixed to."""
+    """Return the position of a joint channel's joint, or of a sensor's mounting object."""
     import mujoco
 
     kind, _, rest = name.partition(".")

@@ -1,9 +1,9 @@
-"""Charts as data: what the page's own script draws from a table that lies in the page.
+"""Declarative chart specification: what the page's script draws from a table in the page.
 
-A chart has panels, a panel has series, and a series names columns of a table (a CSV text in the
-page): what is drawn, what is shown at the cursor and what can be saved as CSV are the same numbers.
-In addition the page holds the same figure as matplotlib draws it: for print, without JavaScript,
-and to be saved as SVG and PNG, and as PDF where one was asked for.
+A chart has panels, a panel has series, and a series names columns of a table (CSV text in the
+page): the drawing, the values at the cursor and the saved CSV contain the same numbers. In
+addition, the page contains the same figure drawn by Matplotlib: for print, for use without
+JavaScript, and to be saved as SVG and PNG, and as PDF if requested.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, Literal
 from bench.figures.style import Look
 
 Scale = Literal["linear", "log", "symlog"]
-"""Of an axis; symlog is linear from 0 to 1 and logarithmic beyond."""
+"""Scale of an axis; symlog is linear from 0 to 1 and logarithmic above."""
 Draw = Literal["line", "steps", "points", "bars"]
 
 
@@ -24,13 +24,13 @@ class Axis:
     """One axis of a panel.
 
     Attributes:
-        label: with its unit, e.g. ``speed [m/s]``.
-        scale: at first; a reader may change it, but for categories.
-        scales: that a reader may choose from.
-        ticks: where there are ticks, if somewhere in particular.
-        names: of categories at 0, 1, 2, ...; empty for numbers.
-        ends: the range shown at first; that of the data where None.
-        holds: values that the range of the data is widened to.
+        label: Label with unit, e.g. ``speed [m/s]``.
+        scale: Initial scale, which a reader may change unless the axis has categories.
+        scales: Scales from which a reader may choose.
+        ticks: Tick positions; empty for automatic ones.
+        names: Names of categories at 0, 1, 2, ...; empty for numbers.
+        ends: Initial range; None for the range of the data.
+        holds: Values that the range of the data is extended to include.
     """
 
     label: str
@@ -44,18 +44,19 @@ class Axis:
 
 @dataclass(frozen=True)
 class Series:
-    """One line, staircase, cloud or row of bars.
+    """One line, staircase, set of points or row of bars.
 
     Attributes:
-        name: in the legend; series of one name are switched on and off together, in the whole page.
-        y: column of the table.
-        look: colour, dashes and marker.
-        where: only rows with these texts in these columns.
-        low: column of the interval's lower end; empty for none.
-        high: column of its upper end.
-        draw: how.
-        shift: along a category axis, so that marks of several series stand side by side.
-        under: points beneath the lines, and not upon them.
+        name: Name in the legend; all series of one name on the page are switched on and off
+            together.
+        y: Column of the table.
+        look: Colour, dashes and marker.
+        where: Texts by column that select the rows.
+        low: Column of the interval's lower end; empty for none.
+        high: Column of the interval's upper end; empty for none.
+        draw: Kind of drawing.
+        shift: Shift along a category axis that places marks of several series side by side.
+        under: Whether points are drawn below the lines instead of above.
     """
 
     name: str
@@ -71,16 +72,15 @@ class Series:
 
 @dataclass(frozen=True)
 class Tell:
-    """A line of what is said at the cursor: the number of a column, with its unit, and the same
-    once more in another unit.
+    """A line of the text at the cursor: the value of a column, optionally also in another unit.
 
     Attributes:
-        says: what it is.
-        y: column of the panel's table.
-        unit: of the column; empty for a pure number.
-        look: beside it; None for none.
-        times: factor to the other unit; 0 for none.
-        also: the other unit.
+        says: Description of the value.
+        y: Column of the panel's table.
+        unit: Unit of the column; empty for a pure number.
+        look: Style of the mark next to it; None for no mark.
+        times: Conversion factor to the other unit; 0 for no other unit.
+        also: The other unit.
     """
 
     says: str
@@ -93,7 +93,7 @@ class Tell:
 
 @dataclass(frozen=True)
 class Rule:
-    """A line across a panel at a value of one axis, with a few words."""
+    """A line across a panel at a value of one axis, with a short text."""
 
     value: float
     says: str
@@ -102,15 +102,15 @@ class Rule:
 
 @dataclass(frozen=True)
 class Span:
-    """A part of an axis: ground behind the curves, or a strip at their foot.
+    """A part of an axis: a background behind the curves, or a strip below them.
 
     Attributes:
-        low: where it begins.
-        high: where it ends.
-        says: what it stands for.
-        look: its colour; grey where None.
-        foot: a strip at the foot of the panel, and not the whole height.
-        along: which axis it is a part of.
+        low: Lower end.
+        high: Upper end.
+        says: Description.
+        look: Style that gives its colour; None for grey.
+        foot: Whether to draw a strip at the bottom of the panel instead of the whole height.
+        along: Axis that it is a part of.
     """
 
     low: float
@@ -126,19 +126,19 @@ class Panel:
     """One pair of axes.
 
     Attributes:
-        title: above it.
-        table: name of the table in the page that it draws.
-        x: column of the table.
-        series: in the order of the legend.
-        across: horizontal axis.
-        up: vertical axis.
-        facets: what tells it from the other panels, e.g. ``{"targets": "in the training range"}``;
-            a reader chooses among values.
-        rules: lines across it.
-        spans: parts of its axes.
-        tells: what is said at the cursor, of rows as those of the first series; the series
-            themselves where empty.
-        height: pixels; by its width where 0.
+        title: Title above the panel.
+        table: Name of the table in the page.
+        x: Column of the horizontal coordinate.
+        series: Series in the order of the legend.
+        across: Horizontal axis.
+        up: Vertical axis.
+        facets: Values that distinguish it from other panels, e.g. ``{"targets": "in the training
+            range"}``; a reader chooses among them.
+        rules: Lines across the panel.
+        spans: Parts of its axes.
+        tells: Lines of the text at the cursor, for rows of the first series; empty for the series
+            themselves.
+        height: Height in pixels; 0 to derive it from the width.
     """
 
     title: str
@@ -156,13 +156,13 @@ class Panel:
 
 @dataclass(frozen=True)
 class Static:
-    """The same figure as it is printed.
+    """A printed version of a figure.
 
     Attributes:
-        image: the bytes of an SVG or PNG file, which the page shows.
-        pdf: the bytes of a PDF file; None where none was asked for.
-        alternative: what it shows, for those who do not see it.
-        file: name of its files without an ending.
+        image: Bytes of an SVG or PNG file, which the page shows.
+        pdf: Bytes of a PDF file; None if not requested.
+        alternative: Text description for readers who cannot see the figure.
+        file: Name of its files without extension.
     """
 
     image: bytes
@@ -176,21 +176,21 @@ class Chart:
     """A figure of the page.
 
     Attributes:
-        name: in the page's address and ids: letters, digits and hyphens.
-        title: above it.
-        caption: how to read it; safe HTML.
-        panels: of which those side by side share their axes where these have the same label.
-        static: the same as it is printed; None where there is none: the figure is then there with
-            the script alone.
-        beside: the facet whose panels stand side by side at first; of every other one panel shows.
-        link: charts with the same text move their cursors and horizontal zoom together.
-        columns: panels side by side where there is room; as many as fit where 0.
-        along: zoom the horizontal axis alone; the vertical one follows what is in sight.
-        toggles: facets whose panels are switched on and off one by one.
-        off: values of toggles that are off at first.
-        lights: the facet by which panels light up together with whatever in the page bears the same
-            name.
-        notes: what the legend says behind a name.
+        name: Name in the page's address and ids: letters, digits and hyphens.
+        title: Title above the figure.
+        caption: Explanation of the figure; safe HTML.
+        panels: Panels; those side by side share axes with the same label.
+        static: Printed version; None if there is none, then the figure needs the script.
+        beside: Facet whose panels are initially side by side; of every other facet one panel is
+            shown.
+        link: Charts with the same text share their cursors and horizontal zoom.
+        columns: Number of panels side by side if there is space; 0 for as many as fit.
+        along: Whether to zoom the horizontal axis only; the vertical axis follows the visible data.
+        toggles: Facets whose panels are switched on and off one by one.
+        off: Values of toggles that are initially off.
+        lights: Facet by which panels are highlighted together with everything of the same name on
+            the page.
+        notes: Texts after names in the legend.
     """
 
     name: str
@@ -208,7 +208,7 @@ class Chart:
     notes: Mapping[str, str] = field(default_factory=dict)
 
     def spec(self) -> dict[str, Any]:
-        """What the page's script is told, as JSON holds it."""
+        """Build the chart's JSON specification for the page's script."""
         return {
             "name": self.name,
             "title": self.title,

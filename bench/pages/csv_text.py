@@ -1,4 +1,4 @@
-"""Tables as CSV text that a spreadsheet opens safely."""
+"""Format tables as CSV text that is safe to open in a spreadsheet."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ from collections.abc import Iterable, Sequence
 
 
 def csv_text(head: Sequence[str], found: Iterable[Sequence[object]]) -> str:
-    """Write a table with these columns as CSV."""
+    """Format a table as CSV.
+
+    Args:
+        head: Names of the columns.
+        found: Rows.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(head)
-    # What begins like a formula is one to a spreadsheet; names are from files.
+    # A spreadsheet would run text that begins like a formula, and names come from files.
     writer.writerows([_plain(cell) for cell in row] for row in found)
     return text.getvalue()
 

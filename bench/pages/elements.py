@@ -1,4 +1,7 @@
-"""Pieces of HTML. What stands between tags is safe already, or has passed `safe` here."""
+"""HTML building blocks with escaping.
+
+Text between tags must be safe already or be passed through `safe`.
+"""
 
 from __future__ import annotations
 
@@ -9,62 +12,72 @@ from html import escape
 from bench.pages.text import clean
 
 NUMBERS = "-"
-"""A table's head that begins with this is the head of numbers, which stand to the right."""
+"""Prefix of a table's column head that marks numbers, which are right-aligned."""
 
 
 def safe(value: object, most: int = 400) -> str:
-    """A text from a file or plugin, fit to stand in the page, in an attribute too."""
-    # A number is not torn from its percent sign at the end of a line.
+    """Escape a text from a file or plugin for the page, including attributes.
+
+    Args:
+        value: Value to write.
+        most: Maximum length in characters.
+    """
+    # A non-breaking space keeps a number and its percent sign on one line.
     return escape(clean(value, most)).replace(" %", "\u00a0%")
 
 
 def heading(text: str) -> str:
-    """The head of a section."""
+    """Return the head of a section."""
     return f"<h2>{text}</h2>"
 
 
 def paragraph(content: str, kind: str = "") -> str:
-    """A paragraph, perhaps of a class of the style sheet."""
+    """Return a paragraph, optionally with a class of the style sheet.
+
+    Args:
+        content: Safe HTML.
+        kind: Class of the style sheet; empty for none.
+    """
     return f"<p{_of_class(kind)}>{content}</p>"
 
 
 def strong(content: str) -> str:
-    """What a skimming eye should meet."""
+    """Return emphasised text."""
     return f"<strong>{content}</strong>"
 
 
 def code(content: str) -> str:
-    """A registered name or a path."""
+    """Return a registered name or a path as code."""
     return f"<code>{content}</code>"
 
 
 def listed(items: Iterable[str]) -> str:
-    """A list with dots."""
+    """Return a bulleted list."""
     return "<ul>" + "".join(f"<li>{item}</li>" for item in items) + "</ul>"
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]], marks: Sequence[str] = ()) -> str:
-    """A table of cells that are safe already.
+    """Return a table of cells that are safe HTML already.
 
     Args:
-        heads: of the columns, see `NUMBERS`.
-        rows: of as many cells.
-        marks: a class of the style sheet for each row; none at all for plain rows.
+        heads: Heads of the columns, see `NUMBERS`.
+        rows: Rows with as many cells.
+        marks: Class of the style sheet for each row; empty for plain rows.
     """
     kinds = ["number" if head.startswith(NUMBERS) else "" for head in heads]
     top = []
     for head, kind in zip(heads, kinds, strict=True):
-        # The scope ties cells to their heads for those who have the table read to them.
+        # The scope connects cells with their heads for screen readers.
         top.append(f'<th scope="col"{_of_class(kind)}>{head.removeprefix(NUMBERS)}</th>')
     body = []
     for row, mark in zip(rows, marks or [""] * len(rows), strict=True):
         cells = [f"<td{_of_class(k)}>{c}</td>" for c, k in zip(row, kinds, strict=True)]
         body.append(f"<tr{_of_class(mark)}>{''.join(cells)}</tr>")
-    # A wide table scrolls by itself, by keys too: the page must not, or its text could not be read
-    # on a phone.
+    # A wide table scrolls separately, since a page that scrolls sideways is hard to read on a
+    # phone.
     return "\n".join(
         [
-            # By keyboard it scrolls once it has the focus.
+            # With tabindex the table can get the focus and be scrolled by keyboard.
             '<div class="scroll" tabindex="0"><table>',
             f"<thead><tr>{''.join(top)}</tr></thead>",
             "<tbody>",
@@ -76,35 +89,47 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], marks: Sequence[s
 
 
 def folded(head: str, content: str) -> str:
-    """What is shown once its head is clicked on."""
+    """Return content that is shown after a click on its head.
+
+    Args:
+        head: Safe HTML.
+        content: Safe HTML.
+    """
     return f"<details>\n<summary>{head}</summary>\n{content}\n</details>"
 
 
 def figure(png: bytes, alternative: str, caption: str) -> str:
-    """A picture within the page itself, with its caption.
+    """Return an image embedded in the page, with its caption.
 
     Args:
-        png: the picture.
-        alternative: what it shows, for those who do not see it; safe.
-        caption: safe.
+        png: Bytes of the PNG file.
+        alternative: Text description for readers who cannot see it; safe HTML.
+        caption: Safe HTML.
     """
-    # Within the page: a report that is sent to somebody stays one file.
+    # Embedded, so that a report remains one file when it is sent.
     data = b64encode(png).decode("ascii")
     image = f'<img src="data:image/png;base64,{data}" alt="{alternative}">'
     return f"<figure>\n{image}\n<figcaption>{caption}</figcaption>\n</figure>"
 
 
 def bar(kind: str, share: float) -> str:
-    """A bar over so much of its cell, 0 to 100 %."""
+    """Return a bar that covers a share of its cell, 0 to 100 %.
+
+    Args:
+        kind: Class of the style sheet.
+        share: Width in percent.
+    """
     style = f"display:block;width:{share:.1f}%"
     return f'<span><span class="bar {kind}" style="{style}"></span></span>'
 
 
 def framed(html: str) -> str:
-    """A page as an element of another one: neither's styles nor scripts reach the other, and of
-    scripts none runs but the page's own, by its policy.
+    """Embed a page in another one as a sandboxed frame.
+
+    Neither page's styles or scripts affect the other, and the frame's policy allows only its own
+    script.
     """
-    # Quotes too: a bare one would end the attribute, and the rest would be the cell's markup.
+    # Quotes are escaped, since a quote would end the attribute and the rest would become markup.
     source = escape(html, quote=True)
     style = "width: 100%; height: 46rem; border: 0"
     allowed = "allow-scripts allow-downloads"

@@ -15,18 +15,18 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FEW = 15
-"""Rows that a page shows without its script, and at once with it."""
+"""Number of rows that a page shows without its script, and initially with it."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column that is shown.
+    """A displayed column.
 
     Attributes:
-        name: in the table.
-        head: above it, with its unit; the name where empty.
-        digits: significant digits of a number; 0 for texts, as they stand.
-        says: what it is, shown above the head.
+        name: Name in the table.
+        head: Head with unit; empty for the name.
+        digits: Significant digits of numbers; 0 for text.
+        says: Description, shown over the head.
     """
 
     name: str
@@ -40,20 +40,20 @@ class Grid:
     """A table to work with.
 
     Attributes:
-        name: in the page's address and ids: letters, digits and hyphens.
-        title: read aloud, and shown above it.
-        table: name of the table in the page.
-        columns: that are shown; what is saved has all.
-        filters: columns of which a reader chooses a value.
-        only: values chosen at first, by column of `filters`.
-        sort: column by which it is sorted at first, downwards with ``,down`` behind it; empty for
-            as it stands.
-        switch: column of names that legends switch on and off; empty for none.
-        marked: a column, and the beginning of its text in rows that stand out; empty for none.
-        lights: column of names by which rows light up together with whatever in the page bears the
-            same name.
-        links: column of addresses to which the first shown column leads; empty for none. Such an
-            address is a path from where the page lies, quoted (`urllib.parse.quote`).
+        name: Name in the page's address and ids: letters, digits and hyphens.
+        title: Title above the table, also for screen readers.
+        table: Name of the table in the page.
+        columns: Displayed columns; a saved file has all columns.
+        filters: Columns of which a reader chooses a value.
+        only: Initial choices, by column of `filters`.
+        sort: Column of the initial order, descending if followed by ``,down``; empty to keep the
+            order.
+        switch: Column of names that legends switch on and off; empty for none.
+        marked: A column, and the beginning of its text in highlighted rows; empty for none.
+        lights: Column of names by which rows are highlighted together with everything of the same
+            name on the page.
+        links: Column of addresses to which the first displayed column links; empty for none. Such
+            an address is a path relative to the page, quoted (`urllib.parse.quote`).
     """
 
     name: str
@@ -69,14 +69,14 @@ class Grid:
     links: str = ""
 
     def spec(self) -> dict[str, Any]:
-        """What the page's script is told, as JSON holds it."""
+        """Build the grid's JSON specification for the page's script."""
         return {**asdict(self), "few": FEW}
 
     def html(self, frame: pd.DataFrame | Table) -> str:
-        """Render the table as it stands without a script: the first rows of the first choice.
+        """Render the table for a page without script: the first rows of the initial choice.
 
         Args:
-            frame: the table that the page holds as CSV.
+            frame: The table that the page contains as CSV.
         """
         table = (
             frame
@@ -108,7 +108,7 @@ class Grid:
         cells: list[str] = []
         for column in self.columns:
             value = row[column.name]
-            # Longer than elsewhere: of a traceback every line is wanted.
+            # Long texts are shortened here; the stored table has them in full.
             cells.append(number(value, column.digits) if column.digits else safe(value, 300))
         if self.links and row[self.links]:
             cells[0] = f'<a href="{safe(row[self.links], 2000)}">{cells[0]}</a>'

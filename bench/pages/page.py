@@ -1,8 +1,8 @@
-"""A page: one HTML file that asks nobody for anything.
+"""Self-contained HTML page: sections, tables and charts.
 
-Styles, scripts, tables and figures are within it, and its Content-Security-Policy forbids every
-request and every script but its own. It is whole without JavaScript: figures are static then, and
-tables show their first rows.
+Styles, scripts, tables and figures are inside the file, and its Content-Security-Policy forbids
+every request and every script but its own. The page is complete without JavaScript: figures are
+static then, and tables show their first rows.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ _LIBRARY = _HERE / "vendor" / "uplot"
 _SCRIPTS = (
     "text", "tables", "state", "ticks", "look", "draw", "panel", "files", "figure", "grid", "page",
 )  # fmt: skip
-"""In this order: one that comes later may use what came before."""
+"""Scripts in the order of their dependencies: a later one may use earlier ones."""
 
 
 class Page:
-    """A page that is put together part by part.
+    """A page that is assembled part by part.
 
     Args:
-        title: of the window.
-        made: what made it, for its foot; safe HTML.
-        style: rules of CSS besides those that every page has.
+        title: Title of the window.
+        made: Text about its origin for the footer; safe HTML.
+        style: CSS rules in addition to those of every page.
     """
 
     def __init__(self, title: str, made: str, style: str = "") -> None:
@@ -50,16 +50,16 @@ class Page:
         self._grids: list[dict[str, Any]] = []
 
     def add(self, *parts: str) -> None:
-        """Put safe HTML at the end of the page."""
+        """Append safe HTML to the page."""
         self._parts += [part for part in parts if part]
 
     def section(self, name: str, head: str, *parts: str) -> None:
-        """Put a section at the end of the page, and a link to it above.
+        """Append a section to the page, and a link to it in the navigation.
 
         Args:
-            name: in the page's address: letters, digits and hyphens.
-            head: above it; safe HTML.
-            parts: what it holds; safe HTML. A section of nothing is left out.
+            name: Name in the page's address: letters, digits and hyphens.
+            head: Title of the section; safe HTML.
+            parts: Content; safe HTML. A section without content is left out.
         """
         held = [part for part in parts if part]
         if held:
@@ -68,19 +68,19 @@ class Page:
             self.add(f'<section id="{name}" aria-labelledby="{name}-head">\n{body}\n</section>')
 
     def table(self, name: str, frame: pd.DataFrame | Table, digits: int | None = None) -> None:
-        """Keep a table in the page, for charts and grids, to be saved as NAME.csv.
+        """Store a table in the page for charts and grids, to be saved as NAME.csv.
 
         Args:
-            name: of the table.
-            frame: its rows.
-            digits: significant digits of its numbers; all where None.
+            name: Name of the table.
+            frame: Its rows.
+            digits: Significant digits of its numbers; None for all.
         """
         self._frames[name] = frame
         style = None if digits is None else f"%.{digits}g"
         self._tables[name] = frame.to_csv(index=False, float_format=style)
 
     def chart(self, chart: Chart) -> str:
-        """A figure as HTML; its tables must be in the page."""
+        """Return a chart as HTML; its tables must be in the page."""
         self._charts.append(chart.spec())
         still = _still(chart.static) if chart.static else ""
         caption = f"<figcaption>{chart.caption}</figcaption>"
@@ -99,14 +99,15 @@ class Page:
         tables: Sequence[str] = (),
         spots: Sequence[tuple[str, float, float]] = (),
     ) -> str:
-        """A figure that is the same on the screen and on paper, with its files to take away.
+        """Return a figure that is identical on screen and on paper, with its files for download.
 
         Args:
-            name: in the page's address: letters, digits and hyphens.
-            static: the figure.
-            caption: how to read it; safe HTML.
-            tables: of the page, with its numbers.
-            spots: names that light up, and where: shares of width and height from above left.
+            name: Name in the page's address: letters, digits and hyphens.
+            static: The figure.
+            caption: Explanation of the figure; safe HTML.
+            tables: Names of the page's tables with its numbers.
+            spots: Names to highlight with their positions, as fractions of width and height from
+                the top left.
         """
         of = f' data-tables="{safe(" ".join(tables))}"' if tables else ""
         return (
@@ -115,14 +116,14 @@ class Page:
         )
 
     def grid(self, grid: Grid) -> str:
-        """A table to work with as HTML; its table must be in the page."""
+        """Return a grid as HTML; its table must be in the page."""
         self._grids.append(grid.spec())
         shown = grid.html(self._frames[grid.table])
         head = f'<h3 id="{grid.name}-title">{safe(grid.title)}</h3>'
         return f'<div class="grid" id="{grid.name}">\n{head}\n{shown}\n</div>'
 
     def html(self) -> str:
-        """The whole page."""
+        """Return the complete page as HTML."""
         data = {"tables": self._tables, "charts": self._charts, "grids": self._grids}
         library = (_LIBRARY / "uPlot.iife.min.js").read_text(encoding="utf-8")
         own = "\n".join(_script(name) for name in _SCRIPTS)
@@ -152,24 +153,24 @@ class Page:
 
 
 def embedded(value: object) -> str:
-    """A value as JSON that may stand in a script element: nothing in it can end the element.
+    """Convert a value to JSON that cannot end the script element that contains it.
 
     Raises:
-        ValueError: a number is not finite, which JSON cannot hold.
+        ValueError: A number is not finite, which JSON cannot represent.
     """
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    # "</script>" and "<!--" mean something to whoever reads the page as HTML, whatever is in it.
+    # "</script>" and "<!--" have a meaning in HTML even inside of JSON text.
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _policy(script: str) -> str:
-    """What the page may do: run its one script, show what is within it, and nothing else."""
+    """Return the page's policy: run its single script, show embedded content, nothing else."""
     digest = b64encode(sha256(script.encode()).digest()).decode("ascii")
     return "; ".join(
         [
             "default-src 'none'",
             f"script-src 'sha256-{digest}'",
-            # Styles cannot ask for anything that the other lines forbid.
+            # Styles cannot load anything that the other lines forbid.
             "style-src 'unsafe-inline'",
             "img-src data: blob:",
             "base-uri 'none'",
@@ -179,7 +180,7 @@ def _policy(script: str) -> str:
 
 
 def _still(static: Static, spots: Sequence[tuple[str, float, float]] = ()) -> str:
-    """Build the HTML of the printed figure, and of its PDF where there is one."""
+    """Build the HTML of the printed figure, and of its PDF if there is one."""
     kind = "png" if static.image.startswith(b"\x89PNG") else "svg+xml"
     data = b64encode(static.image).decode("ascii")
     file = safe(static.file)
@@ -194,7 +195,7 @@ def _still(static: Static, spots: Sequence[tuple[str, float, float]] = ()) -> st
     for name, across, down in spots:
         style = f"left:{100 * across:.2f}%;top:{100 * down:.2f}%"
         image += f'<span class="spot" data-lights="{safe(name, 60)}" style="{style}"></span>'
-    # The script adds its buttons to this paragraph, so it stands there without a PDF too.
+    # The script adds its buttons to this paragraph, so it is needed without a PDF, too.
     return f'<div class="pictured">{image}</div>\n<p class="files">{link}</p>'
 
 

@@ -1,7 +1,7 @@
-"""A table of a page: named columns of equal length, without pandas.
+"""Table of a page: named columns of equal length, without pandas.
 
-Importing pandas takes longer than drawing a figure, and the report of `explain` needs nothing of it
-but rows, columns and CSV.
+Importing pandas takes longer than drawing a figure, and the report of `explain` only needs rows,
+columns and CSV.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ class Table:
     """Named columns of equal length.
 
     Args:
-        columns: values by column name, in the order of the columns; None and NaN are missing.
+        columns: Values by column name, in the order of the columns; None and NaN are missing.
 
     Raises:
-        ValueError: the columns differ in length.
+        ValueError: The columns differ in length.
     """
 
     def __init__(self, columns: Mapping[str, Sequence[Any]]) -> None:
@@ -54,7 +54,7 @@ class Table:
         return Table({name: v for name, v in self._columns.items() if name not in names})
 
     def rows(self) -> list[dict[str, Any]]:
-        """List the rows, each a value by column name."""
+        """List the rows as dictionaries with a value for each column name."""
         return [
             dict(zip(self._columns, row, strict=True))
             for row in zip(*self._columns.values(), strict=True)
@@ -64,9 +64,12 @@ class Table:
         """Write the table as CSV, as `pandas.DataFrame.to_csv` does; missing values are empty.
 
         Args:
-            index: False only: there is none.
-            float_format: format of floating-point numbers, as ``%.6g``. None writes the shortest
-                text that reads back as the same number.
+            index: Must be False, since there is no index.
+            float_format: Format of floating-point numbers, such as ``%.6g``. None writes the
+                shortest text that reads back as the same number.
+
+        Raises:
+            ValueError: `index` is True.
         """
         if index:
             raise ValueError("expected index=False, since a table has no index")
@@ -81,7 +84,7 @@ class Table:
 
 
 def is_missing(value: object) -> bool:
-    """Whether a cell holds no value: None or NaN."""
+    """Return whether a cell has no value: None or NaN."""
     return value is None or value != value
 
 

@@ -1,8 +1,8 @@
-"""A folder as one archive that can be checked: a zip file with a manifest of every file's hash.
+"""Store a folder as a zip archive with a manifest of file hashes.
 
-The same folder gives the same bytes (with the same zlib): names are sorted, times are fixed. What
-an archive of unknown origin could do to whoever unpacks it is looked for before anything is
-written: paths that leave the folder, links, more bytes than it says or than any run has.
+The same folder gives the same bytes (with the same zlib): names are sorted, times are fixed. Before
+an archive of unknown origin is unpacked, it is checked for attacks: paths outside the folder,
+links, more bytes than stated or than any result has.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from sims.files import replacing
 
 MANIFEST = "manifest.json"
 LARGEST = 8 << 30
-"""Bytes that an archive may unpack to."""
+"""Maximum size of an unpacked archive in bytes."""
 DENSEST = 200
-"""Times its own size that it may unpack to, where that is more than `_HARMLESS`."""
+"""Maximum ratio of unpacked to packed size, if the unpacked size exceeds `_HARMLESS`."""
 _HARMLESS = 100 << 20
 _MOST = 100_000
-"""Files in an archive."""
+"""Maximum number of files in an archive."""
 _MANIFEST_BYTES = 64 << 20
 _BLOCK = 1 << 20
 _EPOCH = (1980, 1, 1, 0, 0, 0)
-"""The first time that a zip file can hold: the time of every file in one of ours."""
+"""The earliest time that a zip file can store, which is given to every file."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 0x1
 _LONGEST = 1000
-"""Characters of a path."""
+"""Maximum length of a path in characters."""
 
 
 class Fault(NamedTuple):
-    """What is not as the manifest says.
+    """A difference between an archive and its manifest.
 
     Attributes:
-        file: in the archive's folder.
-        says: what was expected, and what was found.
+        file: Path in the archive's folder.
+        says: What was expected, and what was found.
     """
 
     file: str
@@ -55,16 +55,16 @@ class Fault(NamedTuple):
 
 
 def pack(archive: Path, name: str, files: Mapping[str, Path], about: Mapping[str, Any]) -> None:
-    """Write an archive, whole or not at all.
+    """Write an archive completely or not at all.
 
     Args:
-        archive: a new file.
-        name: of the folder in it.
-        files: by path in that folder, where each is now.
-        about: what the manifest says beside the files.
+        archive: Path of a new file.
+        name: Name of the folder in the archive.
+        files: Path of each file on disk, by its path in that folder.
+        about: Entries of the manifest in addition to the files.
 
     Raises:
-        InputError: it is there already, or a file cannot be read or written.
+        InputError: The archive exists already, or a file cannot be read or written.
     """
     if archive.exists():
         raise InputError(f"{archive}: exists already; name another file with --out")
@@ -87,7 +87,7 @@ def pack(archive: Path, name: str, files: Mapping[str, Path], about: Mapping[str
 
 def _entry(path: str) -> zipfile.ZipInfo:
     entry = zipfile.ZipInfo(path, _EPOCH)
-    entry.create_system = 3  # Unix, whatever this machine is
+    entry.create_system = 3  # Always Unix, so that the bytes do not depend on this machine.
     entry.external_attr = (stat.S_IFREG | 0o644) << 16
     entry.compress_type = zipfile.ZIP_DEFLATED
     return entry
@@ -97,9 +97,9 @@ class Unpacked(NamedTuple):
     """An archive that has been unpacked.
 
     Attributes:
-        folder: what was in it, for as long as it is looked at.
-        manifest: what it says of itself.
-        faults: what is not as the manifest says.
+        folder: Temporary folder with its content.
+        manifest: Its manifest.
+        faults: Differences from the manifest.
     """
 
     folder: Path
@@ -109,10 +109,10 @@ class Unpacked(NamedTuple):
 
 @contextmanager
 def unpacked(archive: Path) -> Iterator[Unpacked]:
-    """An archive in a folder of its own, which is gone when the block ends.
+    """Context that unpacks an archive into a temporary folder.
 
     Raises:
-        InputError: it is no archive of simgap's, or nothing that anybody should unpack.
+        InputError: It is not an archive of simgap, or unpacking it could be harmful.
     """
     try:
         with zipfile.ZipFile(archive) as packed, TemporaryDirectory(prefix="simgap-") as place:
@@ -135,10 +135,10 @@ def unpacked(archive: Path) -> Iterator[Unpacked]:
 
 
 def _sound(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
-    """The entries of an archive that can be unpacked without harm.
+    """Return the entries of an archive if all of them can be unpacked safely.
 
     Raises:
-        InputError: there is one that cannot.
+        InputError: One cannot.
     """
     entries = packed.infolist()
     if len(entries) > _MOST:
@@ -146,7 +146,7 @@ def _sound(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
     for entry in entries:
         if wrong := _wrong(entry):
             raise _refused(archive, f"{entry.filename[:80]!r} {wrong}")
-    # Two names that a file system takes for one would hide what the first holds.
+    # Two names that a file system treats as equal would overwrite each other's file.
     twice = [name for name, n in Counter(e.filename.casefold() for e in entries).items() if n > 1]
     if twice:
         raise _refused(archive, f"{twice[0]!r} is in it twice")
@@ -159,10 +159,10 @@ def _sound(archive: Path, packed: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
 
 
 def _wrong(entry: zipfile.ZipInfo) -> str:
-    """Why an entry must not be unpacked; empty where it may."""
+    """Return why an entry must not be unpacked; empty if it may be."""
     name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
     parts = name.split("/")
-    # A zip file that names one path in two places shows one of them to each reader.
+    # If the two stored names of an entry differ, programs would unpack it to different paths.
     if name != entry.orig_filename or "\\" in name or ":" in name or not name.isprintable():
         return "is no plain path"
     if len(name) > _LONGEST or any(part in ("", ".", "..") for part in parts):
@@ -181,7 +181,7 @@ def _refused(archive: Path, why: str) -> InputError:
 
 
 def _top(archive: Path, entries: list[zipfile.ZipInfo]) -> str:
-    """The one folder that all of it is in."""
+    """Return the single top-level folder of an archive."""
     tops = {entry.filename.partition("/")[0] for entry in entries}
     if len(tops) != 1 or f"{(top := tops.pop())}/{MANIFEST}" not in {e.filename for e in entries}:
         raise InputError(
@@ -207,7 +207,7 @@ def _manifest(archive: Path, packed: zipfile.ZipFile, top: str) -> dict[str, Any
 def _written(
     archive: Path, packed: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path
 ) -> tuple[int, str]:
-    """Unpack one file; its size and hash."""
+    """Unpack one file; return its size and hash."""
     digest, size = hashlib.sha256(), 0
     with packed.open(entry) as source, path.open("wb") as to:
         for block in _blocks(source):
@@ -225,7 +225,7 @@ def _blocks(source: IO[bytes]) -> Iterator[bytes]:
 
 
 def _unlike(manifest: dict[str, Any], found: Mapping[str, tuple[int, str]]) -> Iterator[Fault]:
-    """What is missing, added or other than the manifest says."""
+    """Yield files that are missing, added, or different from the manifest."""
     listed = {each["path"]: (each["bytes"], each["sha256"]) for each in manifest["files"]}
     if len(listed) < len(manifest["files"]):
         yield Fault(MANIFEST, "expected each file once, found one listed twice")

@@ -1,4 +1,4 @@
-"""Cells of a table against what its columns are declared to hold; whole columns at a time."""
+"""Validate table cells against their declared columns, whole columns at a time."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _TEXTS: Mapping[type, str] = {
     int: r"-?\d{1,18}",
     float: r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?|-?inf|nan|",
 }
-"""How values of each type are written in a CSV file."""
+"""Patterns of values in a CSV file, by type."""
 
 
 class CellError(Exception):
-    """A cell, or a whole column, is not what it is declared to be.
+    """A cell or a whole column that violates its declaration.
 
     Attributes:
-        row: the first such, counted from 0; None where it is the column.
-        says: column, expected and found.
+        row: First such row, counted from 0; None if the error is in the column.
+        says: Column, expected and found value.
     """
 
     def __init__(self, row: int | None, column: str, wanted: str, found: str) -> None:
@@ -40,10 +40,15 @@ class CellError(Exception):
 
 
 def columns_of(names: Sequence[str], columns: Columns, row: int | None = None) -> list[Column]:
-    """The declared columns that are there, in a table or in one row of a JSON file.
+    """Select the declared columns that a table or a row of a JSON file has.
+
+    Args:
+        names: Names of its columns.
+        columns: Declared columns.
+        row: Row for the error message; None for a table.
 
     Raises:
-        CellError: a required one is missing, or one is there twice.
+        CellError: A required column is missing, or a column occurs twice.
     """
     for name in names:
         if names.count(name) > 1:
@@ -57,16 +62,20 @@ def columns_of(names: Sequence[str], columns: Columns, row: int | None = None) -
 
 
 def of_parquet(column: Column, values: pa.Array) -> pa.Array:
-    """A column of a Parquet file as text, int64, float64 or bool.
+    """Convert a column of a Parquet file to text, int64, float64 or bool.
+
+    Args:
+        column: Its declaration.
+        values: Its values.
 
     Raises:
-        CellError: it is of another type, or a cell that must not be empty is.
+        CellError: It has another type, or a cell is empty that must not be.
     """
     import pyarrow as pa
     from pyarrow import compute
 
     try:
-        # Flipped bytes of a text need not be one any more.
+        # After damage, the bytes of a text may be invalid UTF-8.
         values.validate(full=True)
     except pa.ArrowInvalid as error:
         raise CellError(None, column.name, column.wanted, first_line(error)) from None
@@ -90,15 +99,19 @@ def of_parquet(column: Column, values: pa.Array) -> pa.Array:
         values = compute.fill_null(values, np.nan)
     try:
         return values.cast(_arrow(column))
-    except pa.ArrowInvalid:  # a number that is too large for the type
+    except pa.ArrowInvalid:  # A number that is too large for the type.
         raise CellError(None, column.name, column.wanted, f"numbers beyond it ({kind})") from None
 
 
 def of_text(column: Column, values: pa.Array) -> pa.Array:
-    """A column of a CSV file as text, int64, float64 or bool.
+    """Convert a column of a CSV file to text, int64, float64 or bool.
+
+    Args:
+        column: Its declaration.
+        values: Its cells as text.
 
     Raises:
-        CellError: a cell is no such value.
+        CellError: A cell cannot be converted.
     """
     from pyarrow import compute
 
@@ -107,22 +120,26 @@ def of_text(column: Column, values: pa.Array) -> pa.Array:
     sound = compute.match_substring_regex(values, f"^({_TEXTS[column.kind]})$")
     _refuse(column, mask_of(compute.invert(sound)), lambda row: shown(values[row].as_py()))
     if column.kind is float:
-        # What is empty is no number.
+        # An empty cell means NaN.
         values = compute.if_else(compute.equal(values, ""), "nan", values)
     return values.cast(_arrow(column))
 
 
 def of_python(column: Column, values: Sequence[Any]) -> pa.Array:
-    """Values of a JSON file as text, int64, float64 or bool.
+    """Convert values of a JSON file to text, int64, float64 or bool.
+
+    Args:
+        column: Declaration of the values.
+        values: Values from the JSON file.
 
     Raises:
-        CellError: one is no such value.
+        CellError: A value has another type or is too large.
     """
     import pyarrow as pa
 
     kinds = (int, float) if column.kind is float else (column.kind,)
     for row, value in enumerate(values):
-        none = value is None and column.kind is float  # JSON has no NaN
+        none = value is None and column.kind is float  # JSON has no NaN.
         mistaken = isinstance(value, bool) and column.kind is not bool
         if not none and (mistaken or not isinstance(value, kinds) or _beyond(value)):
             raise CellError(row, column.name, column.wanted, shown(value))
@@ -131,7 +148,7 @@ def of_python(column: Column, values: Sequence[Any]) -> pa.Array:
 
 
 def _beyond(value: Any) -> bool:
-    """Whether a whole number is too large for the type; JSON's have no end."""
+    """Return whether an integer is too large for int64; integers in JSON are unlimited."""
     return isinstance(value, int) and abs(value) >= 2**63
 
 
@@ -148,16 +165,16 @@ def check(
     at_start: Mask | None = None,
     no_truth: Mask | None = None,
 ) -> None:
-    """See that every cell is what the column is declared to hold.
+    """Check that every cell fits the declaration of its column.
 
     Args:
-        column: as declared.
-        values: as `of_parquet`, `of_text` or `of_python` gives them.
-        at_start: rows with k = 0.
-        no_truth: rows of a recording.
+        column: Its declaration.
+        values: Result of `of_parquet`, `of_text` or `of_python`.
+        at_start: Mask of rows with k = 0.
+        no_truth: Mask of rows of a recording.
 
     Raises:
-        CellError: the first that is not.
+        CellError: The first cell that does not.
     """
     if column.kind is bool:
         return
@@ -201,13 +218,13 @@ def _check_texts(column: Column, values: pa.Array) -> None:
 
 
 def mask_of(values: pa.Array) -> Mask:
-    """Bools as numpy has them."""
+    """Convert an Arrow array of bool to NumPy."""
     mask: Mask = values.to_numpy(zero_copy_only=False).astype(bool)
     return mask
 
 
 def _refuse(column: Column, bad: Mask, said: Callable[[int], str], wanted: str = "") -> None:
-    """Raise for the first row that is bad."""
+    """Raise an error for the first bad row."""
     if bad.any():
         row = int(bad.argmax())
         raise CellError(row, column.name, wanted or column.wanted, said(row))

@@ -1,4 +1,4 @@
-"""CSV files of a result folder, read by their declared columns; a fault is said with its line."""
+"""Read CSV files of a result folder by their declared columns; errors name the line."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 Declared = Callable[[list[str]], Columns]
-"""What the columns of a file are, given those that it has."""
+"""Returns the declared columns of a file for its header."""
 
 
 class Csv:
-    """A CSV file whose cells are what they are declared to be.
+    """A CSV file whose cells fit their declarations.
 
     Args:
-        path: the file.
-        columns: as declared, or what gives them for a file's header.
-        remedy: what to do with a file that is damaged.
+        path: The file.
+        columns: Declared columns, or a function that returns them for a file's header.
+        remedy: Advice for a damaged file.
 
     Attributes:
-        table: the declared columns that are there.
+        table: Declared columns that the file has.
 
     Raises:
-        InputError: it is damaged, in one line.
+        InputError: The file is damaged; the message is one line.
     """
 
     def __init__(self, path: Path, columns: Columns | Declared, remedy: str) -> None:
@@ -47,7 +47,12 @@ class Csv:
             raise self.fault(error.row, error.says) from None
 
     def fault(self, row: int | None, says: str) -> InputError:
-        """The error for a row, counted from 0; or for the file."""
+        """Make the error for a row, counted from 0, or for the whole file.
+
+        Args:
+            row: Row, or None for the file.
+            says: What is wrong.
+        """
         place = "" if row is None else f", line {self._line(row)}"
         return InputError(f"{self._path}{place}: {says}; {self._remedy}")
 
@@ -78,7 +83,7 @@ class Csv:
         return pa.table(typed)
 
     def _texts(self) -> pa.Table:
-        """Every cell as text."""
+        """Read every cell as text."""
         import pyarrow as pa
         from pyarrow import csv as arrow
 
@@ -87,7 +92,7 @@ class Csv:
         try:
             return arrow.read_csv(
                 pa.BufferReader(data),
-                # One block: a reason may be longer than any block.
+                # One block, since a text cell may be longer than any block.
                 arrow.ReadOptions(block_size=min(len(data) + 1, 2**31 - 1), use_threads=False),
                 arrow.ParseOptions(newlines_in_values=True),
                 arrow.ConvertOptions(column_types=texts, null_values=[], strings_can_be_null=False),
@@ -97,7 +102,7 @@ class Csv:
             raise self.fault(None, f"expected a CSV file, found {first_line(error)}") from None
 
     def _refuse_ragged(self) -> None:
-        """Raise for the first line that has not as many cells as the header."""
+        """Raise an error for the first line whose number of cells differs from the header's."""
         for number, record in self._records():
             cells = len(self._fields(record))
             if cells != len(self._header):
@@ -111,7 +116,7 @@ class Csv:
             raise self.fault(None, f"expected cells, found {shown(record)} ({error})") from None
 
     def _records(self) -> Iterator[tuple[int, str]]:
-        """Every record with the line it begins on; a text in quotes may have lines of its own."""
+        """Yield every record with its first line number; quoted text may span several lines."""
         first, inside = 1, False
         parts: list[str] = []
         for number, line in enumerate(self._text.split("\n"), start=1):
@@ -126,6 +131,6 @@ class Csv:
             yield first, "\n".join(parts)
 
     def _line(self, row: int) -> int:
-        """The line of a row; the first record is the header."""
+        """Return the line number of a row; the first record is the header."""
         lines = (number for place, (number, _) in enumerate(self._records()) if place == row + 1)
         return next(lines, row + 2)

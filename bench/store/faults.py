@@ -1,4 +1,4 @@
-"""Faults in rows of a result folder: the first is said, in one line."""
+"""Errors in rows of a result folder; the first bad row is reported in one line."""
 
 from __future__ import annotations
 
@@ -15,13 +15,22 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Fault = Callable[[int, str], InputError]
-"""The error for a row, counted from 0, of a file."""
+"""Makes the error for a row of a file, counted from 0."""
 MaybeFault = Callable[[int | None, str], InputError]
-"""The same, and the error for the whole file."""
+"""Makes the error for a row of a file, counted from 0, or for the whole file (None)."""
 
 
 def refuse(bad: pd.Series | Mask, fault: Fault, says: Callable[[int], str]) -> None:
-    """Raise for the first row that is bad."""
+    """Raise an error for the first bad row.
+
+    Args:
+        bad: Mask of bad rows.
+        fault: Makes the error.
+        says: Describes what is wrong in a row.
+
+    Raises:
+        InputError: There is a bad row.
+    """
     mask = np.asarray(bad, dtype=bool)
     if mask.any():
         row = int(mask.argmax())
@@ -29,7 +38,17 @@ def refuse(bad: pd.Series | Mask, fault: Fault, says: Callable[[int], str]) -> N
 
 
 def check_known(values: pd.Series, known: Iterable[str], what: str, fault: Fault) -> None:
-    """Refuse values that the experiment does not know."""
+    """Reject values that the experiment does not define.
+
+    Args:
+        values: Values to check.
+        known: Values that the experiment defines.
+        what: Name of the quantity.
+        fault: Makes the error.
+
+    Raises:
+        InputError: There is an unknown value.
+    """
     refuse(
         ~values.isin(list(known)),
         fault,
@@ -38,7 +57,18 @@ def check_known(values: pd.Series, known: Iterable[str], what: str, fault: Fault
 
 
 def check_equal(found: pd.Series, wanted: pd.Series, name: str, why: str, fault: Fault) -> None:
-    """Refuse values that are not the wanted ones; nothing is the same as nothing."""
+    """Reject values that differ from the expected ones; two missing values are equal.
+
+    Args:
+        found: Values to check.
+        wanted: Expected values.
+        name: Name of the column.
+        why: Reason for the expected values.
+        fault: Makes the error.
+
+    Raises:
+        InputError: A value differs.
+    """
     differ = found.to_numpy() != wanted.to_numpy()
     refuse(
         differ & ~(found.isna() & wanted.isna()).to_numpy(),

@@ -1,6 +1,4 @@
-"""The folder of a comparison: exact configuration, versions and machine, a row a simulation, a
-status a run.
-"""
+"""Folder of a comparison: configuration, versions, machine, simulations and run statuses."""
 
 from __future__ import annotations
 
@@ -29,19 +27,23 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CONFIGURATION = "experiment.toml"
-"""The file by which the folder of a study is known."""
+"""Name of the file that identifies the folder of a study."""
 SALT = "salt"
-"""The file of a secret salt, below the folder of segments."""
+"""Name of the file of a secret salt, in the folder of segments."""
 RESULTS = Path("results")
-"""Below which new runs go that name no folder."""
+"""Default parent folder of new results."""
 
 
 def free_folder(experiment: Experiment, out: Path | None, results: Path = RESULTS) -> Path:
-    """Where a new run may be written: `out`, or a folder below `results` named for the experiment
-    and the time.
+    """Choose the folder of a new study.
+
+    Args:
+        experiment: The experiment.
+        out: Wanted folder; None for a folder in `results` named after the experiment and the time.
+        results: Parent of such a folder.
 
     Raises:
-        InputError: `out` exists and has something in it.
+        InputError: `out` exists and is not empty.
     """
     folder = out or stamped(results, experiment.name)
     try:
@@ -52,13 +54,13 @@ def free_folder(experiment: Experiment, out: Path | None, results: Path = RESULT
 
 
 class Configuration(NamedTuple):
-    """What a folder is for.
+    """Configuration of a study's folder.
 
     Attributes:
-        experiment: the exact configuration.
-        plugins: plugin files that it needs.
-        fingerprint: hashes of what must not change until it is complete.
-        seals: that held around its tuners where it was begun.
+        experiment: The exact configuration of the experiment.
+        plugins: Plugin files that it needs.
+        fingerprint: Hashes of what must not change until the study is complete.
+        seals: Isolation layers that were available for its tuners when it was started.
     """
 
     experiment: Experiment
@@ -75,18 +77,18 @@ def create(
     seals: Sequence[str] = (),
     redraws: Redraws | None = None,
 ) -> None:
-    """Make the folder with experiment.toml and environment.json in it, all at once or not at all.
+    """Make the folder with experiment.toml and environment.json, all at once or not at all.
 
     Args:
-        folder: new or empty.
-        configuration: what it is for.
-        jobs: worker processes that it is meant to be made with.
-        secret: the salt that its targets are drawn from; see `bench.store.secret`.
-        seals: that hold around its tuners on this machine.
-        redraws: how many targets were drawn again; None for studies without such targets.
+        folder: Path of a new or empty folder.
+        configuration: Its configuration.
+        jobs: Planned number of worker processes.
+        secret: Salt from which its targets are drawn; see `bench.store.secret`.
+        seals: Isolation layers that are available for its tuners on this machine.
+        redraws: Number of targets that were drawn again; None for studies without such targets.
 
     Raises:
-        InputError: it cannot be made.
+        InputError: The folder cannot be made.
     """
     experiment = configuration.experiment
     environment = {
@@ -104,7 +106,7 @@ def create(
     if redraws is not None:
         environment |= {"redrawn_targets": redraws.redrawn, "target_draws": redraws.draws}
     try:
-        # What there is of a folder is never without what it is for.
+        # An interrupted start must not leave a folder without its configuration.
         with fresh_folder(folder) as partial:
             write_configuration(partial, experiment)
             write(partial / "environment.json", json.dumps(environment, indent=1) + "\n")
@@ -116,21 +118,21 @@ def create(
 
 
 def _hide(path: Path, secret: str) -> None:
-    """Write a file that its owner alone can read."""
+    """Write a file that only its owner can read."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with os.fdopen(descriptor, "w", encoding="utf-8") as file:
         file.write(secret)
 
 
 def write_configuration(folder: Path, experiment: Experiment) -> None:
-    """Write experiment.toml, whole or not at all."""
+    """Write experiment.toml completely or not at all."""
     import tomli_w
 
     write(folder / CONFIGURATION, tomli_w.dumps(_plain(experiment.document())))
 
 
 def _plain(value: Any) -> Any:
-    """Tuples as lists, mappings as dictionaries: what TOML can hold."""
+    """Convert tuples to lists and mappings to dicts, the types that TOML supports."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, tuple | list):
@@ -139,10 +141,10 @@ def _plain(value: Any) -> Any:
 
 
 def configuration(folder: Path) -> Configuration:
-    """What the folder of a comparison is for.
+    """Read the configuration of a comparison's folder.
 
     Raises:
-        InputError: it is no such folder, or a file in it is damaged.
+        InputError: It is not such a folder, or a file in it is damaged.
     """
     path = folder / CONFIGURATION
     if not path.is_file():
@@ -160,10 +162,10 @@ def configuration(folder: Path) -> Configuration:
 
 
 def environment(folder: Path) -> dict[str, Any]:
-    """What environment.json says, checked; keys that are not declared are left out.
+    """Read and check environment.json; undeclared keys are left out.
 
     Raises:
-        InputError: it is damaged.
+        InputError: It is damaged.
     """
     path = folder / "environment.json"
     wrong, remedy = f"{path}: not a complete comparison", "restore it, or start a new comparison"
@@ -177,7 +179,7 @@ def environment(folder: Path) -> dict[str, Any]:
         if key not in said and key not in OLDER:
             raise InputError(f"{wrong}: expected a key {key}, found none; {remedy}")
     given = {key: value for key, value in said.items() if key in ENVIRONMENT}
-    # Some systems do not say how many there are.
+    # On some systems the number of processors is unknown.
     if given["processors"] is None:
         del given["processors"]
     try:
@@ -193,15 +195,16 @@ def write_results(
     skipped: Iterable[Mapping[str, Any]],
     trusted: bool = False,
 ) -> None:
-    """Write runs.parquet, training.csv and status.csv in the order of the plan, each whole or not
-    at all.
+    """Write runs.parquet, training.csv and status.csv in the order of the plan.
+
+    Each file is written completely or not at all.
 
     Args:
-        folder: the comparison's.
-        journal: its finished runs.
-        trainings: tuner, seed, simulations and seconds of each training.
-        skipped: rows of status.csv for tuners that could not be used.
-        trusted: whether the tuners ran inside the harness.
+        folder: Folder of the comparison.
+        journal: Its finished runs.
+        trainings: Tuner, seed, simulations and seconds of each training.
+        skipped: Rows of status.csv for tuners that could not be used.
+        trusted: Whether the tuners ran inside the harness.
     """
     import pandas as pd
     import pyarrow as pa
@@ -210,7 +213,7 @@ def write_results(
     with replacing(folder / "runs.parquet") as partial:
         writer = None
         for rows in journal.tables():
-            # The first rows say what the columns are.
+            # The first table defines the columns.
             writer = writer or parquet.ParquetWriter(partial, rows.schema, compression="zstd")
             writer.write_table(rows)
         if writer is None:
@@ -228,14 +231,14 @@ def write_results(
 
 
 class Stored(NamedTuple):
-    """A comparison read back.
+    """A comparison read from its folder.
 
     Attributes:
-        experiment: what was compared.
-        runs: rows of runs.parquet.
-        statuses: rows of status.csv.
+        experiment: The experiment.
+        runs: Rows of runs.parquet.
+        statuses: Rows of status.csv.
         costs: (simulations, seconds) of one training, by tuner.
-        spectra: rows of identifiability.csv; None where there is no such file.
+        spectra: Rows of identifiability.csv; None if there is no such file.
     """
 
     experiment: Experiment
@@ -246,22 +249,21 @@ class Stored(NamedTuple):
 
 
 def read(folder: Path, columns: Sequence[str] | None = None) -> Stored:
-    """Read the folder of a comparison that was finished or interrupted; all of it is checked.
+    """Read and check the folder of a finished or interrupted comparison.
 
     Args:
-        folder: the comparison's.
-        columns: of the runs, where not all are wanted; those that there are not are left out.
+        folder: Folder of the comparison.
+        columns: Columns of the runs to read, if present; None for all.
 
     Raises:
-        InputError: the folder lacks a file of a comparison, or something in one is not what
-            `bench.store.schema` declares, or runs are missing.
+        InputError: A file is missing or violates `bench.store.schema`, or runs are missing.
     """
     from pyarrow import parquet
 
     experiment = configuration(folder).experiment
     path = folder / "runs.parquet"
     under_way = (folder / FOLDER).exists()
-    # Killed before its first results were written: nothing is wrong with it.
+    # The study was killed before its first results were written, so nothing is damaged.
     if not path.exists() and under_way:
         raise InputError(
             f"{folder}: not finished, and nothing written yet; resume it to make the rest"
@@ -281,10 +283,10 @@ def read(folder: Path, columns: Sequence[str] | None = None) -> Stored:
 
 
 def checked(folder: Path) -> Stored:
-    """As `read`, and the tables that `simgap plot` writes are checked too.
+    """Read and check a comparison as `read` does, and also check table.csv.
 
     Raises:
-        InputError: something in the folder is damaged.
+        InputError: A file in the folder is damaged.
     """
     stored = read(folder)
     check_table(folder)
@@ -294,7 +296,7 @@ def checked(folder: Path) -> Stored:
 def _with_defaults(
     frame: pd.DataFrame, declared: Columns, wanted: Sequence[str] | None = None
 ) -> pd.DataFrame:
-    """The frame with columns that an older folder lacks and that have a default."""
+    """Add columns with a default that an older folder lacks."""
     missing = {
         column.name: column.default
         for column in declared
@@ -306,7 +308,7 @@ def _with_defaults(
 
 
 def _costs(training: pd.DataFrame) -> dict[str, tuple[float, float]]:
-    """Simulations and seconds of one training, the mean over seeds, by tuner."""
+    """Compute simulations and seconds of one training, mean over seeds, by tuner."""
     means = training.groupby("tuner")[["simulations", "seconds"]].mean()
     values = means.to_numpy(dtype=float)
     return {

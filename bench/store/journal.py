@@ -1,12 +1,11 @@
-"""Finished runs on disk the moment they end: a record each, appended; many records become one
-Parquet part.
+"""Crash-safe journal of finished runs: each is appended as one record the moment it ends.
 
-The folder ``segments`` of a comparison that is under way holds ``plan.txt`` (the id of every run,
-in order), ``NNNNNN.journal`` (records that are being appended) and ``NNNNNN.parquet`` (parts). A
-part is written beside its journal, renamed, and only then is the journal deleted; where both are
-found, the part holds everything. A record that was cut off by a kill fails its checksum and is
-dropped: its run was not finished. What is appended survives the end of any process; the end of the
-machine may cost the runs since the last part.
+The folder ``segments`` of an unfinished comparison contains ``plan.txt`` (the id of every run, in
+order), ``NNNNNN.journal`` (records that are being appended) and ``NNNNNN.parquet`` (parts of many
+records). A part is written next to its journal, renamed, and only then is the journal deleted; if
+both are found, the part contains everything. A record that was cut off by a kill fails its checksum
+and is dropped: its run was not finished. Appended records survive the end of any process; a crash
+of the machine may lose the runs since the last part.
 """
 
 from __future__ import annotations
@@ -34,18 +33,17 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 PART_RUNS = 1000
-"""Records that become a part together."""
+"""Number of records that are combined into a part."""
 
 
 class Journal:
-    """The finished runs of a comparison in `folder`; opening it recovers whatever an earlier
-    process left.
+    """Journal of the finished runs of a comparison; opening it recovers earlier records.
 
     Attributes:
-        statuses: of every finished run, by its place in the plan.
+        statuses: Statuses of all finished runs, by index in the plan.
 
     Raises:
-        InputError: another process is at work in the folder, or a part is damaged.
+        InputError: Another process is working in the folder, or a part is damaged.
     """
 
     def __init__(self, folder: Path, part_runs: int = PART_RUNS) -> None:
@@ -57,7 +55,7 @@ class Journal:
                 f"{self.folder}: expected a folder, found a file; move it elsewhere"
             ) from None
         self._lock = _locked(self.folder / "lock")
-        # Half a part, of a process that was killed while it wrote; its journal is still there.
+        # An incomplete part of a process that was killed while it wrote; its journal still exists.
         for half in self.folder.glob("*.partial"):
             half.unlink()
         self._part_runs = part_runs
@@ -68,10 +66,11 @@ class Journal:
             self._read_parts()
             self._number = 1 + max((int(p.stem) for p in self._index), default=0)
             for path in segments(self.folder, "journal"):
-                # A part holds all of its journal: killed between the two, it would double runs.
+                # A part contains its whole journal. After a kill between writing the one and
+                # deleting the other, reading both would duplicate runs.
                 if int(path.stem) < self._number:
                     path.unlink()
-                else:  # beyond the next where a person deleted a damaged part
+                else:  # Numbers may be skipped if the user deleted a damaged part.
                     self._number = int(path.stem)
             self._file = self._reopened(self._path("journal"))
         except InputError:
@@ -89,27 +88,35 @@ class Journal:
         return self.folder / f"{self._number:06d}.{ending}"
 
     def _reopened(self, path: Path) -> IO[bytes]:
-        """The journal, its whole records read and a cut-off one dropped, ready to append."""
+        """Open a journal for appending: read its complete records and drop one that is cut off."""
         end = 0
         if path.exists():
-            # The last end is where to go on.
+            # Appending continues at the last end.
             for place, status, rows, end in records(path):  # noqa: B007
                 refuse_double(path, [place], self.statuses)
                 self._records.append((place, status, rows))
                 self.statuses[place] = status
-        # Without a buffer: what is written must survive this process.
+        # Unbuffered: what is written must survive a kill of this process.
         file = path.open("r+b" if path.exists() else "w+b", buffering=0)
-        # What was cut off by a kill goes, or the next record would stand behind half a one.
+        # Remove a record that was cut off by a kill, or the next one would follow an incomplete
+        # record.
         file.truncate(end)
         file.seek(end)
         return file
 
     def add(self, place: int, columns: Mapping[str, Any], status: Status) -> None:
-        """Keep a finished run; when this returns, it survives a kill."""
+        """Append a finished run; when this returns, the run survives a kill.
+
+        Args:
+            place: Index of the run in the plan.
+            columns: Rows of the run, by column.
+            status: How the run ended.
+        """
         import pyarrow as pa
 
         rows = pa.table(dict(columns))
-        # One write: a kill leaves a record whole or cut off, never two that are mixed.
+        # A single write: after a kill a record is complete or cut off, but never mixed with
+        # another.
         self._file.write(record(place, status, rows))
         self._records.append((place, status, rows))
         self.statuses[place] = status
@@ -121,14 +128,14 @@ class Journal:
         from pyarrow import parquet
 
         self._records.sort(key=lambda record: record[0])
-        # In the footer, where statuses are read without reading the rows.
+        # The footer allows reading the statuses without reading the rows.
         statuses = json.dumps([[place, asdict(status)] for place, status, _ in self._records])
         tables = [_placed(place, rows) for place, _, rows in self._records]
         whole = pa.concat_tables(tables).replace_schema_metadata({"statuses": statuses})
         path = self._path("parquet")
         with replacing(path) as partial:
             parquet.write_table(whole, partial, compression="zstd")
-        # Only now: until the part is there, the journal is all there is of these runs.
+        # Not earlier: until the part exists, the journal is the only copy of these runs.
         self._file.close()
         self._path("journal").unlink()
         self._index[path] = [place for place, _, _ in self._records]
@@ -137,13 +144,17 @@ class Journal:
         self._file = self._reopened(self._path("journal"))
 
     def tables(self, runs: int = 2000) -> Iterator[pa.Table]:
-        """The rows of all finished runs in the order of the plan, about `runs` runs at a time."""
+        """Yield the rows of all finished runs in the order of the plan, chunk by chunk.
+
+        Args:
+            runs: Approximate number of runs in a chunk.
+        """
         import pyarrow as pa
         from pyarrow import compute, parquet
 
         pending = {place: rows for place, _, rows in self._records}
         places = sorted(self.statuses)
-        # By chunks: all rows of a million runs would fill memory.
+        # In chunks, since all rows of a million runs would not fit in memory.
         for first in range(0, len(places), runs):
             chunk = places[first : first + runs]
             low, high = chunk[0], chunk[-1]
@@ -159,8 +170,10 @@ class Journal:
             yield whole.take(order).drop_columns(["place"])
 
     def files(self) -> Iterator[tuple[Path, dict[int, Status], list[pa.Table] | None]]:
-        """What each file holds: statuses by place, and the rows of the journal that is appended to;
-        those of a part are in its file.
+        """Yield the content of each file.
+
+        The content is the statuses by index in the plan, and the rows of the current journal; the
+        rows of a part are None, since they are in its file.
         """
         for path, places in self._index.items():
             yield path, {place: self.statuses[place] for place in places}, None
@@ -169,16 +182,17 @@ class Journal:
             yield self._path("journal"), held, [rows for _, _, rows in self._records]
 
     def close(self) -> None:
-        """Let others work in the folder."""
+        """Close the journal and release the lock of the folder."""
         self._file.close()
         self._lock.close()
 
     def discard(self) -> None:
-        """Delete the segments; their content stands elsewhere. Renamed first, so that no half of
-        them is ever met.
+        """Delete the segments, whose content has been stored elsewhere.
+
+        The folder is renamed first, so that an incomplete one is never found.
         """
         self.close()
-        # Half a folder of segments would count as a comparison under way.
+        # An incomplete folder of segments would count as an unfinished comparison.
         gone = self.folder.with_name(f".{FOLDER}.gone")
         shutil.rmtree(gone, ignore_errors=True)
         self.folder.rename(gone)
@@ -193,13 +207,13 @@ def _placed(place: int, rows: pa.Table) -> pa.Table:
 
 
 def _locked(path: Path) -> IO[str]:
-    """The lock of the folder: held until this process ends, however it ends."""
+    """Lock the folder until this process ends in any way."""
     file = path.open("a", encoding="ascii")
     try:
         import fcntl
 
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except ImportError:  # no such locks on this system
+    except ImportError:  # This system has no such locks.
         pass
     except OSError:
         file.close()

@@ -1,4 +1,4 @@
-"""With what results were made: versions and machine, and of an explanation what was asked."""
+"""Provenance of results: versions, machine, and the settings of an explanation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENVIRONMENT = "environment.json"
 
 
 def machine() -> dict[str, Any]:
-    """Python and the machine."""
+    """Describe Python and the machine."""
     return {
         "python": sys.version,
         "platform": platform.platform(),
@@ -36,7 +36,10 @@ def packages() -> dict[str, str]:
 
 
 def _name_and_version(distribution: Distribution) -> tuple[str, str]:
-    """Read both from the head of the metadata: parsing all of it takes 20 times as long."""
+    """Read name and version from the head of the metadata.
+
+    Parsing all of it takes 20 times as long.
+    """
     text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
     lines = text.partition("\n\n")[0].splitlines()
     head = dict(line.split(": ", 1) for line in lines if _FIELD.match(line))
@@ -49,16 +52,16 @@ _FIELD = re.compile("(Name|Version): ")
 
 
 def now() -> str:
-    """The time, UTC."""
+    """Return the present time in UTC."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def explaining(recordings: Iterable[object], settings: Mapping[str, Any]) -> list[str]:
-    """The words of the command that explains recordings.
+    """Return the words of the command that explains recordings.
 
     Args:
-        recordings: their tables.
-        settings: of `simgap explain`, by the names of its options; what is not set is left out.
+        recordings: Paths of their tables.
+        settings: Options of `simgap explain` by name; unset options are left out.
     """
     words = ["simgap", "explain", *map(str, recordings)]
     for name, value in settings.items():
@@ -75,13 +78,16 @@ def explaining(recordings: Iterable[object], settings: Mapping[str, Any]) -> lis
 def write_explained(
     folder: Path, started: str, settings: Mapping[str, Any], recordings: Iterable[Path]
 ) -> Path:
-    """Write what an explanation was made with and of.
+    """Write the provenance of an explanation to its folder.
 
     Args:
-        folder: the explanation's.
-        started: time, UTC.
-        settings: of `simgap explain`, by the names of its options.
-        recordings: the tables; each stands with its description where there is one.
+        folder: Folder of the explanation.
+        started: Time of the start, UTC.
+        settings: Options of `simgap explain` by name.
+        recordings: Paths of the tables; their descriptions are included if they exist.
+
+    Returns:
+        Path of environment.json.
     """
     told = {
         "simgap": __version__,
@@ -103,7 +109,7 @@ def write_explained(
 
 
 def environment(folder: Path) -> dict[str, Any]:
-    """What environment.json says; empty where there is none, as beside an older explanation."""
+    """Read environment.json; return an empty dict if there is none, as for old explanations."""
     try:
         told = json.loads((folder / ENVIRONMENT).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -112,7 +118,7 @@ def environment(folder: Path) -> dict[str, Any]:
 
 
 def sha256(path: Path) -> str:
-    """Of a file's content."""
+    """Compute the SHA-256 hash of a file."""
     with path.open("rb") as file:
         digest = hashlib.sha256()
         while block := file.read(1 << 20):

@@ -1,4 +1,4 @@
-"""What an experiment asks for: targets, seeds, runs; and that a plan is one of it, and whole."""
+"""List the targets, seeds and runs of an experiment, and check plans for completeness."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ _SEED = re.compile("[0-9]{1,9}")
 
 
 def targets_of(experiment: Experiment) -> list[str]:
-    """The names of all targets of an experiment."""
+    """List the names of all targets of an experiment."""
     return [f"{kind}-{i:03d}" for i in range(experiment.targets) for kind in experiment.ranges]
 
 
 def labels_of(experiment: Experiment) -> list[str]:
-    """The labels of its tuners."""
+    """List the labels of an experiment's tuners."""
     return [entry.label for entry in experiment.tuners]
 
 
 def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: str) -> None:
-    """See that a plan is one of the experiment, and whole.
+    """Check that a plan belongs to an experiment and is complete.
 
     Args:
-        plan: the id of every run.
-        experiment: what is compared.
-        path: of the plan.
-        remedy: what to do where it is damaged.
+        plan: The id of every run.
+        experiment: The experiment.
+        path: Path of the plan.
+        remedy: Advice for a damaged plan.
 
     Raises:
-        InputError: something does not hold.
+        InputError: A check fails.
     """
     import pandas as pd
 
@@ -63,12 +63,15 @@ def check_plan(plan: Sequence[str], experiment: Experiment, path: Path, remedy: 
 
 
 def check_complete(made: pd.DataFrame, experiment: Experiment, fault: MaybeFault) -> None:
-    """See that no run is missing of a tuner that has some, and that none is one too many.
+    """Check that each tuner with runs has all of its runs, and no more.
 
     Args:
-        made: tuner, target and seed of each; the index is the row in the file.
-        experiment: what was compared.
-        fault: makes the error for a row, or for the file.
+        made: Tuner, target and seed of each run; the index is the row in the file.
+        experiment: The experiment.
+        fault: Makes the error for a row, or for the file.
+
+    Raises:
+        InputError: A run is missing, or there is one too many.
     """
     targets = targets_of(experiment)
     for entry in experiment.tuners:
@@ -93,13 +96,17 @@ def check_complete(made: pd.DataFrame, experiment: Experiment, fault: MaybeFault
 
 
 def _seeds(entry: Entry, experiment: Experiment, largest: int) -> int:
-    """How many seeds an entry runs; as `bench.runs.runner.seeds_of`, where its tuner is known."""
+    """Return the number of seeds of an entry.
+
+    It equals `bench.runs.runner.seeds_of` if the tuner is known.
+    """
     wanted = entry.seeds or experiment.seeds
     if wanted == 1 or largest > 0:
         return wanted
-    # One seed is right for a tuner without chance. Only now, for a tuner may import much.
+    # A single seed is correct for a deterministic tuner. The tuner is loaded only now, since it may
+    # import large packages.
     try:
         kind = tuners.get(entry.tuner)
-    except InputError:  # of a plugin that is not loaded, or cannot be used here
+    except InputError:  # A tuner of a plugin that is not loaded or cannot be used here.
         return 1
     return wanted if kind.stochastic or kind.learned else 1

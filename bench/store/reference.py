@@ -1,9 +1,8 @@
-"""Reference results: comparisons that were run and looked at, which figures draw in grey behind a
-user's own.
+"""Reference results: checked comparisons that figures draw in grey behind the user's own.
 
-Those of a checkout are below results/reference, those of an installed wheel below bench/reference;
-of each the wheel has the table, the configuration and the environment. Any folder with these three
-serves too.
+In a checkout they are below results/reference, in an installed wheel below bench/reference; the
+wheel contains the table, configuration and environment of each. Any other folder with these three
+files can be used, too.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ if TYPE_CHECKING:
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _PLACES = (_PACKAGE.parent / "results" / "reference", _PACKAGE / "reference")
-"""Where references are: beside a checkout's packages, or in the wheel's."""
+"""Folders of references: in the root of a checkout, or in the package of a wheel."""
 _TABLE = "table.csv"
 _DRAWN = ("tuner", "range", "simulations", "metric", "median")
 _COLUMNS = [column for column in TABLE if column.name in _DRAWN]
-"""Of a table; an older one may lack others."""
+"""Columns of a table that are read; an older table may lack others."""
 _SAME_PROBLEM = ("simulator", "model", "recording", "observe", "error_channel")
-"""Keys without whose agreement two errors have nothing to do with each other."""
+"""Keys that must be equal for the errors of two comparisons to be comparable."""
 _ALIKE = (
     "ranges",
     "targets",
@@ -52,7 +51,7 @@ _ALIKE = (
     "held_out",
     "free",
 )
-"""Keys whose difference is said."""
+"""Keys whose differences are reported."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +59,13 @@ class Reference:
     """A reference result.
 
     Attributes:
-        name: by which it was asked for.
-        folder: where it lies.
-        table: rows of its table.csv: tuner, range, simulations, metric, median.
-        document: its experiment.toml.
-        simgap: version that made it.
-        revision: hash of the code that made its runs; empty where it is not known.
-        started: time, UTC.
+        name: Name by which it was requested.
+        folder: Its folder.
+        table: Rows of its table.csv: tuner, range, simulations, metric, median.
+        document: Content of its experiment.toml.
+        simgap: Version that made it.
+        revision: Hash of the code that made its runs; empty if unknown.
+        started: Time of its start, UTC.
     """
 
     name: str
@@ -84,18 +83,18 @@ class Reference:
 
     @property
     def provenance(self) -> str:
-        """``ball-drop (simgap 0.1.0, code 9276d6d2c3, 2026-11-21)``."""
+        """Provenance as text: ``ball-drop (simgap 0.1.0, code 9276d6d2c3, 2026-11-21)``."""
         code = f", code {self.revision}" if self.revision else ""
         return f"{self.name} (simgap {self.simgap}{code}, {self.started[:10]})"
 
     def mismatches(self, experiment: Experiment) -> list[str]:
-        """How it differs from an experiment that stands before it, a line each.
+        """List the differences from an experiment that is drawn over it, one line each.
 
         Raises:
-            InputError: it is of another problem, whose errors say nothing about these.
+            InputError: It is of another problem, so the errors are not comparable.
         """
         mine = _plain(experiment.document())
-        # Keys that a later version has added say nothing about an older file.
+        # Keys that were added in a later version cannot be compared with an older file.
         differing = [
             key
             for key in (*_SAME_PROBLEM, *_ALIKE)
@@ -112,7 +111,17 @@ class Reference:
         ]
 
     def curve(self, tuner: str, kind: str, metric: str, budget: int) -> pd.DataFrame:
-        """Simulations up to a budget, and the median after them; empty where there is none."""
+        """Return the median of a metric by number of simulations, up to a budget.
+
+        Args:
+            tuner: Label of the tuner.
+            kind: Range of the targets.
+            metric: Name of the metric.
+            budget: Maximum number of simulations.
+
+        Returns:
+            Columns simulations and median; empty if there is no such curve.
+        """
         lines = self.table
         part = lines[
             (lines["tuner"] == tuner)
@@ -123,7 +132,12 @@ class Reference:
         return part[["simulations", "median"]].dropna().sort_values("simulations")
 
     def document_of(self, experiment: Experiment, drawn: list[Path]) -> dict[str, Any]:
-        """For programs."""
+        """Build the JSON document of the reference.
+
+        Args:
+            experiment: Experiment that is drawn over it.
+            drawn: Paths of the figures.
+        """
         return {
             "name": self.name,
             "simgap": self.simgap,
@@ -135,7 +149,7 @@ class Reference:
 
 
 def names() -> list[str]:
-    """The references that come with simgap, as their folders are called."""
+    """List the names of the references of simgap, which are the names of their folders."""
     found = [
         table.parent.relative_to(place).as_posix()
         for place in _PLACES
@@ -146,7 +160,7 @@ def names() -> list[str]:
 
 
 def _is_one(folder: Path) -> bool:
-    """Whether it is a comparison's: a bounce shot has no curve of errors."""
+    """Return whether a folder is a comparison's; a bounce shot has no error curves."""
     if not (folder / CONFIGURATION).is_file():
         return False
     with (folder / _TABLE).open(encoding="utf-8") as file:
@@ -154,12 +168,12 @@ def _is_one(folder: Path) -> bool:
 
 
 def find(name: str) -> Reference:
-    """A reference by its name, or by the folder of any comparison.
+    """Find a reference by its name, or by the folder of any comparison.
 
-    ``comparison/ball-wind`` is found as ``ball-wind`` too, where no other is called so.
+    ``comparison/ball-wind`` is also found as ``ball-wind`` if no other reference has this name.
 
     Raises:
-        InputError: there is none, or what is there is damaged.
+        InputError: There is no such reference, or it is damaged.
     """
     known = names()
     endings = [each for each in known if each.endswith(f"/{name}")]
@@ -195,7 +209,7 @@ def _read(name: str, folder: Path) -> Reference:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers and lists in one form, whether from TOML or from an experiment."""
+    """Convert numbers to float and tuples to lists, so that TOML and experiments compare equal."""
     if isinstance(value, Mapping):
         return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -204,7 +218,7 @@ def _plain(value: Any) -> Any:
 
 
 def _said(value: Any) -> str:
-    """A value in a line."""
+    """Format a value in one line."""
     if isinstance(value, Mapping):
         inside = ", ".join(f"{key} = {_said(inner)}" for key, inner in value.items())
         return f"{{{inside}}}"[:80]

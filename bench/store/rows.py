@@ -1,5 +1,6 @@
-"""Rows of runs, as runs.parquet and the parts of a journal hold them: read batch by batch, every
-cell checked, and every run whole.
+"""Read rows of runs batch by batch, and check every cell and the completeness of every run.
+
+The rows are those of runs.parquet and of the parts of a journal.
 """
 
 from __future__ import annotations
@@ -22,51 +23,58 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _BATCH = 131_072
-"""Rows that are checked at a time: all columns of many would fill memory."""
+"""Number of rows checked at a time; all columns of many rows would not fit in memory."""
 
 
 class RunsFile(NamedTuple):
     """A file of runs.
 
     Attributes:
-        path: the file.
-        remedy: what to do where it is damaged.
+        path: Path of the file.
+        remedy: Advice for a damaged file.
     """
 
     path: Path
     remedy: str
 
     def fault(self, row: int | None, says: str) -> InputError:
-        """The error for a row, counted from 0; or for the file."""
+        """Make the error for a row, counted from 0, or for the whole file.
+
+        Args:
+            row: Row, or None for the file.
+            says: What is wrong.
+        """
         place = "" if row is None else f", row {row}"
         return InputError(f"{self.path}{place}: {says}; {self.remedy}")
 
     def names(self) -> list[str]:
-        """Its columns.
+        """List the columns of the file.
 
         Raises:
-            InputError: it is no Parquet file.
+            InputError: It is not a Parquet file.
         """
         from pyarrow import ArrowException, parquet
 
         try:
             return list(parquet.read_schema(self.path).names)
-        # Of damaged bytes even the names of columns may be no text.
+        # In a damaged file even the names of columns may be invalid text.
         except (OSError, ArrowException, UnicodeDecodeError) as error:
             raise self._unreadable(error) from None
 
     def runs(
         self, experiment: Experiment, records: Sequence[pa.Table] | None = None
     ) -> pd.DataFrame:
-        """A line a run, in the order of the file: what is the same in all its rows, the ``row`` at
-        which it begins, and ``used``, its last k.
+        """Read one line per run, in the order of the file.
+
+        Each line has the columns that are constant within the run, ``row``, at which it begins, and
+        ``used``, its last k.
 
         Args:
-            experiment: whose runs they are.
-            records: what has been read already, of a file that is no Parquet file.
+            experiment: Experiment of the runs.
+            records: Tables that were read before, for a file that is not Parquet.
 
         Raises:
-            InputError: the file is damaged, in one line.
+            InputError: The file is damaged; the message is one line.
         """
         import pyarrow as pa
 
@@ -95,27 +103,37 @@ class RunsFile(NamedTuple):
 
 
 def declared(names: list[str], experiment: Experiment) -> list[Column]:
-    """The columns of the runs of an experiment: its parameters and channels are those that the file
-    speaks of, and those that the experiment names.
+    """Return the declared columns of an experiment's runs.
+
+    The parameters and channels are those in the file's columns and those of the experiment.
+
+    Args:
+        names: Names of the file's columns.
+        experiment: The experiment.
     """
     parameters = dict.fromkeys([*parameters_in(names), *experiment.parameters])
     channels = experiment.observe or channels_in(names)
     columns = spelled(RUNS, parameters or ["PARAMETER"], channels or ["CHANNEL"])
-    # Of one parameter the error is there in its own unit too.
+    # A single parameter also has its error in its own unit.
     return [c for c in columns if c.name != "param_abs_error" or len(parameters) == 1]
 
 
 def checked_runs(
     batches: Iterable[pa.Table], names: list[str], experiment: Experiment
 ) -> pd.DataFrame:
-    """A line a run; see `RunsFile.runs`.
+    """Check rows of runs and return one line per run; see `RunsFile.runs`.
+
+    Args:
+        batches: The rows, as consecutive tables.
+        names: Names of the columns.
+        experiment: Experiment of the runs.
 
     Raises:
-        CellError: something is not what it is declared to be.
+        CellError: A cell or a run violates its declaration.
     """
     import pandas as pd
 
-    # Where no run was made there are no columns either.
+    # Without runs there are no columns.
     there = columns_of(names, declared(names, experiment)) if names else []
     told: list[pd.DataFrame] = []
     before: pa.Table | None = None
@@ -132,7 +150,7 @@ def checked_runs(
         if told
         else pd.DataFrame(columns=["run", *OF_A_RUN, "row"])
     )
-    # k counts without a gap, so that the number of rows tells the last one.
+    # k counts without gaps, so the number of rows gives the last k.
     runs["used"] = np.diff(np.append(runs["row"].to_numpy(dtype=np.int64), offset)) - 1
     twice = runs["run"].duplicated().to_numpy(dtype=bool)
     if twice.any():
@@ -145,10 +163,10 @@ def checked_runs(
 def _checked(
     batch: pa.Table, there: list[Column], before: pa.Table | None, offset: int
 ) -> pa.Table:
-    """The batch in its declared types, behind the last row of the one before.
+    """Convert a batch to its declared types and prepend the last row of the previous batch.
 
     Raises:
-        CellError: a cell is not what it is declared to be, or a run is not whole.
+        CellError: A cell violates its declaration, or a run is incomplete.
     """
     import pyarrow as pa
     from pyarrow import compute
@@ -178,12 +196,12 @@ def _moved(error: CellError, row: int | None) -> CellError:
 
 
 def _new(rows: pa.Table) -> Mask:
-    """(n,) where a run begins; the first row is taken for such a place."""
+    """Return an (n,) mask of rows where a run begins, including the first row."""
     return np.append(True, _changes(rows["run"]))
 
 
 def _changes(values: pa.ChunkedArray) -> Mask:
-    """(n - 1,) where a value is not the one before it; nothing is the same as nothing."""
+    """Return an (n - 1,) mask of values that differ from the previous one; NaN equals NaN."""
     import pyarrow as pa
     from pyarrow import compute
 
@@ -198,11 +216,11 @@ def _changes(values: pa.ChunkedArray) -> Mask:
 
 
 def _check_counts(rows: pa.Table, goes_on: bool) -> None:
-    """See that k counts 0, 1, 2, ... in every run."""
+    """Check that k counts 0, 1, 2, ... in every run."""
     k: NDArray[np.int64] = rows["k"].to_numpy()
     wanted = np.append(0, k[:-1] + 1)
     wanted[_new(rows)] = 0
-    if goes_on:  # the first row is known, whatever its k
+    if goes_on:  # The first row was checked with the previous batch.
         wanted[0] = k[0]
     bad = k != wanted
     if bad.any():
@@ -212,13 +230,13 @@ def _check_counts(rows: pa.Table, goes_on: bool) -> None:
 
 
 def _described(rows: pa.Table) -> list[str]:
-    """The columns that are the same in all rows of a run."""
+    """List the columns that are constant within a run."""
     names = rows.column_names
     return [name for name in names if name in OF_A_RUN or name.startswith("true_")]
 
 
 def _check_same(rows: pa.Table) -> None:
-    """See that what describes a run is the same in all its rows."""
+    """Check that the columns that describe a run are constant within it."""
     within = ~_new(rows)[1:]
     for name in _described(rows):
         bad = _changes(rows[name]) & within
@@ -229,7 +247,7 @@ def _check_same(rows: pa.Table) -> None:
 
 
 def _begun(rows: pa.Table, goes_on: bool, offset: int) -> pd.DataFrame:
-    """A line for each run that begins in these rows."""
+    """Return one line for each run that begins in these rows."""
     new = _new(rows)
     if goes_on:
         new[0] = False

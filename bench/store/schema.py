@@ -1,8 +1,8 @@
-"""What stands in the files of a result folder: every column and key, declared once.
+"""Declaration of every column and key in the files of a result folder.
 
 `bench.store.cells` checks the cells of a column, `bench.store.rows` the rows of a run, and
-`bench.store.sound` what must hold between files. A column that is added later is `required=False`
-and has a `default`, so that older folders still read.
+`bench.store.sound` the consistency between files. A column that is added later is `required=False`
+and has a `default`, so that older folders can still be read.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bench.problem.experiment import RANGES
 from bench.store.status import STATUSES
 
 SHOT_STATUSES = (*STATUSES, "no plan", "no recording")
-"""Words by which a shot of a bounce shot ends."""
+"""Possible statuses of a bounce shot."""
 METRICS = (
     "param_abs_error",
     "param_error",
@@ -26,11 +26,11 @@ METRICS = (
     "obs_error",
     "heldout_error",
 )
-"""Errors that table.csv has lines of: columns of runs.parquet."""
+"""Error metrics in table.csv, which are columns of runs.parquet."""
 
 
 class Empty(Enum):
-    """Where the cells of a column are empty: text without a letter, a number that is none."""
+    """Where cells of a column are empty, that is empty text or NaN."""
 
     NEVER = "never"
     MAY = "anywhere"
@@ -40,18 +40,18 @@ class Empty(Enum):
 
 @dataclass(frozen=True)
 class Column:
-    """One column.
+    """Declaration of a column.
 
     Attributes:
-        name: ``PARAMETER`` or ``CHANNEL`` in it stands for each that there is.
+        name: Name; ``PARAMETER`` or ``CHANNEL`` in it stands for each parameter or channel.
         kind: str, int, float or bool.
-        low: the least number.
-        high: the largest one.
-        words: the only texts that there are; any where there are none.
-        empty: where there is no value.
-        infinite: whether a number may be infinite.
-        required: whether a file without it is damaged.
-        default: of a column that is not there.
+        low: Smallest allowed number.
+        high: Largest allowed number.
+        words: Allowed texts; empty for any text.
+        empty: Where cells are empty.
+        infinite: Whether a number may be infinite.
+        required: Whether a file without the column is damaged.
+        default: Value if the column is missing.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Column:
 
     @property
     def wanted(self) -> str:
-        """What a cell must be, for a message."""
+        """Description of a valid cell, for messages."""
         if self.words:
             return f"one of {', '.join(word for word in self.words if word)}"
         if self.kind in (str, bool):
@@ -82,16 +82,16 @@ class Column:
 
 Columns = Sequence[Column]
 _LARGEST = 2.0**53
-"""Of the whole numbers that a float can count."""
+"""Upper limit of whole numbers that a float represents exactly."""
 
 
 def _size(name: str, empty: Empty = Empty.NEVER, **options: Any) -> Column:
-    """A number that is not negative."""
+    """Declare a column of non-negative numbers."""
     return Column(name, float, low=0.0, empty=empty, **options)
 
 
 def _count(name: str, low: int = 0, **options: Any) -> Column:
-    """A whole number that is not negative."""
+    """Declare a column of whole numbers that are not negative."""
     return Column(name, int, low=low, high=_LARGEST, **options)
 
 
@@ -121,14 +121,14 @@ RUNS: Columns = (
     _size("simulator_seconds", Empty.AT_START),
     _TRUSTED,
 )
-"""runs.parquet, parts and records: a row a simulation."""
+"""Columns of runs.parquet, parts and records: one row per simulation."""
 
 OF_A_RUN = ("experiment", "tuner", "simulator", "target", "seed", "range", "outside", "trusted")
-"""Columns of `RUNS` that are the same in every row of a run; every true parameter is too."""
+"""Columns of `RUNS` that are constant within a run, as are all true parameters."""
 
 STATUS: Columns = (
     *(Column(name, str) for name in ("run", "tuner", "simulator")),
-    Column("target", str, empty=Empty.MAY),  # of a tuner that was skipped
+    Column("target", str, empty=Empty.MAY),  # Of a tuner that was skipped.
     _count("seed"),
     Column("status", str, words=STATUSES),
     Column("reason", str, empty=Empty.MAY),
@@ -136,7 +136,7 @@ STATUS: Columns = (
     _size("seconds"),
     _TRUSTED,
 )
-"""status.csv of a comparison, and the statuses of parts and records: a row a run."""
+"""Columns of a comparison's status.csv and of stored statuses: one row per run."""
 
 TRAINING: Columns = (
     Column("tuner", str),
@@ -145,7 +145,7 @@ TRAINING: Columns = (
     _size("seconds"),
     _TRUSTED,
 )
-"""training.csv: a row a training."""
+"""Columns of training.csv: one row per training."""
 
 IDENTIFIABILITY: Columns = (
     Column("experiment", str),
@@ -157,7 +157,7 @@ IDENTIFIABILITY: Columns = (
     Column("stiff", bool),
     Column("PARAMETER", float, low=-1.0 - 1e-9, high=1.0 + 1e-9),
 )
-"""identifiability.csv: a row a target and direction."""
+"""Columns of identifiability.csv: one row per target and direction."""
 
 TABLE: Columns = (
     Column("experiment", str),
@@ -175,7 +175,7 @@ TABLE: Columns = (
     Column("salt", str, words=("secret", "public"), required=False),
     _TRUSTED,
 )
-"""table.csv of a comparison."""
+"""Columns of a comparison's table.csv."""
 
 _MODEL = Column("model", str, words=("plain", "extended"))
 MISSPECIFIED_TABLE: Columns = (
@@ -191,7 +191,7 @@ MISSPECIFIED_TABLE: Columns = (
     _count("failures"),
     _TRUSTED,
 )
-"""table.csv of a study of a missing effect; an error of no one parameter has no name of one."""
+"""Columns of table.csv of a study of a missing effect; errors over all parameters name none."""
 
 _RANKED = Column("metric", str, words=("param_error", "heldout_error"))
 MISSPECIFIED_RANKS: Columns = (
@@ -201,7 +201,7 @@ MISSPECIFIED_RANKS: Columns = (
     *(_size(name) for name in ("plain", "extended")),
     _TRUSTED,
 )
-"""ranks.csv of a study of a missing effect: mean rank over targets in each simulator."""
+"""Columns of ranks.csv of a study of a missing effect: mean rank over targets by simulator."""
 
 MISSPECIFIED_RANKING: Columns = (
     Column("experiment", str),
@@ -218,7 +218,7 @@ MISSPECIFIED_RANKING: Columns = (
     ),
     _TRUSTED,
 )
-"""ranking.csv of a study of a missing effect: whether the simulators rank tuners alike."""
+"""Columns of ranking.csv of a study of a missing effect: agreement of tuner rankings."""
 
 MODEL: Columns = (
     Column("method", str),
@@ -230,7 +230,7 @@ MODEL: Columns = (
     _size("height", Empty.MAY),
     Column("margin", float, empty=Empty.MAY),
 )
-"""A model in shots/NAME.json, beside its ``effects``."""
+"""Keys of a model in shots/NAME.json, in addition to its ``effects``."""
 
 SHOTS: Columns = (
     *(Column(name, str) for name in ("shot", "ball", "method")),
@@ -251,7 +251,7 @@ SHOTS: Columns = (
     _size("seen", high=1.0),
     _TRUSTED,
 )
-"""shots.csv of a bounce shot; without the last the rows in shots/NAME.json."""
+"""Columns of a bounce shot's shots.csv; rows in shots/NAME.json lack the last column."""
 
 SHOT_STATUS: Columns = tuple(
     replace(column, words=SHOT_STATUSES)
@@ -261,7 +261,7 @@ SHOT_STATUS: Columns = tuple(
     else column
     for column in STATUS
 )
-"""status.csv of a bounce shot."""
+"""Columns of a bounce shot's status.csv."""
 
 SHOT_TABLE: Columns = (
     Column("method", str),
@@ -276,7 +276,7 @@ SHOT_TABLE: Columns = (
     _count("failures"),
     _TRUSTED,
 )
-"""table.csv of a bounce shot."""
+"""Columns of a bounce shot's table.csv."""
 
 ENVIRONMENT: Mapping[str, Any] = {
     "simgap": str,
@@ -295,13 +295,19 @@ ENVIRONMENT: Mapping[str, Any] = {
     "redrawn_targets": int,
     "target_draws": int,
 }
-"""environment.json: by key what its value is; a file may have others beside them."""
+"""Types of the values in environment.json, by key; a file may have further keys."""
 OLDER = ("fingerprint", "seals", "stepping", "redrawn_targets", "target_draws")
-"""Keys that folders of an older simgap lack; the last two are of comparisons of tuners alone."""
+"""Keys that folders of an older simgap may lack; the last two belong to tuner comparisons only."""
 
 
 def spelled(columns: Columns, parameters: Iterable[str], channels: Iterable[str]) -> list[Column]:
-    """The columns with a column for each parameter and channel that there is."""
+    """Replace placeholder columns by one column for each parameter and channel.
+
+    Args:
+        columns: Declared columns.
+        parameters: Names that replace ``PARAMETER``.
+        channels: Names that replace ``CHANNEL``.
+    """
     names = {"PARAMETER": list(parameters), "CHANNEL": list(channels)}
     result = []
     for column in columns:
@@ -314,12 +320,12 @@ def spelled(columns: Columns, parameters: Iterable[str], channels: Iterable[str]
 
 
 def parameters_in(names: Iterable[str]) -> list[str]:
-    """The parameters that a file's columns speak of."""
+    """List the parameters in the names of a file's columns."""
     return _spoken_of(names, "proposal_", "recommendation_", "true_")
 
 
 def channels_in(names: Iterable[str]) -> list[str]:
-    """The channels that a file's columns speak of."""
+    """List the channels in the names of a file's columns."""
     found = _spoken_of(names, "obs_error_", "heldout_error_")
     return list(dict.fromkeys(name.removesuffix("_in_noise") for name in found))
 

@@ -1,5 +1,7 @@
-"""The secret salt of a study in its folder: apart and for its owner alone while there is work left,
-in experiment.toml when all is done.
+"""Store the secret salt of a study until it is revealed.
+
+While runs are missing, the salt is in a separate file that only its owner can read; when the study
+is complete, it is in experiment.toml.
 """
 
 from __future__ import annotations
@@ -14,17 +16,17 @@ from sims.base import InputError
 
 
 def salted(experiment: Experiment, salt: str | None) -> tuple[Experiment, str | None]:
-    """An experiment about to begin, and the secret that its targets are drawn from.
+    """Draw or take the secret salt of a new study, and commit to it by its hash.
 
     Args:
-        experiment: what is asked for; a salt in it is public.
-        salt: given by a person; a fresh one where None.
+        experiment: The experiment; a salt in it is public.
+        salt: Salt given by the user; None for a fresh one.
 
     Returns:
-        The experiment with the secret's hash, and the secret; None where the salt is public.
+        The experiment with the secret's hash, and the secret; None if the salt is public.
 
     Raises:
-        InputError: two salts were given, or an impossible one.
+        InputError: Two salts were given, or an invalid one.
     """
     if experiment.salt and salt not in (None, experiment.salt):
         raise InputError(
@@ -41,10 +43,14 @@ def salted(experiment: Experiment, salt: str | None) -> tuple[Experiment, str | 
 
 
 def kept(folder: Path, experiment: Experiment) -> str | None:
-    """The secret salt of a study that is to be resumed; None where it is public, or revealed.
+    """Read the secret salt of a study to be resumed; None if it is public or revealed.
+
+    Args:
+        folder: Folder of the study.
+        experiment: Its experiment.
 
     Raises:
-        InputError: it is gone, or not the one that was committed.
+        InputError: It is missing, or differs from the committed one.
     """
     if experiment.salt or not experiment.salt_sha256:
         return None
@@ -61,7 +67,12 @@ def kept(folder: Path, experiment: Experiment) -> str | None:
 
 
 def reveal(folder: Path, secret: str | None) -> None:
-    """Write the salt where everybody can read it: nothing is left that it could help."""
+    """Write the salt to experiment.toml, since the study is complete.
+
+    Args:
+        folder: Folder of the study.
+        secret: The salt; None if it is public, then nothing is done.
+    """
     if secret is None:
         return
     write_configuration(folder, configuration(folder).experiment.chosen(salt=secret))

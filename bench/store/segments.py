@@ -1,5 +1,6 @@
-"""The files of a comparison that is under way, as they stand: its plan, records of finished runs,
-and parts; `bench.store.journal` writes them.
+"""Segment files of an unfinished comparison: its plan, records of finished runs, and parts.
+
+`bench.store.journal` writes them.
 """
 
 from __future__ import annotations
@@ -24,22 +25,28 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 FOLDER = "segments"
-"""Below a comparison's folder, while it is under way."""
+"""Name of the folder of segments in the folder of an unfinished comparison."""
 PLAN = "plan.txt"
-"""In it, the id of every run."""
+"""Name of the file of the plan, which lists the id of every run."""
 PLAN_REMEDY = "restore it, or delete it and resume the comparison, which writes it again"
-"""What to do with a plan that is damaged."""
+"""Advice for a damaged plan."""
 _HEAD = struct.Struct(">4sII")
-"""Of a record: mark, length of what follows, its checksum."""
+"""Head of a record: mark, length of the content, checksum of the content."""
 _MARK = b"run\n"
-"""With which a record begins."""
+"""Mark at the beginning of a record."""
 REMEDY = "restore it, or delete it and resume the comparison: its runs are made again"
-"""What to do with a segment that is damaged."""
+"""Advice for a damaged segment."""
 _PLACE = Column("place in the plan", int, low=0, high=2.0**31)
 
 
 def record(place: int, status: Status, rows: pa.Table) -> bytes:
-    """A record of a journal: a finished run, with its checksum."""
+    """Encode a finished run as a record of a journal, with a checksum.
+
+    Args:
+        place: Index of the run in the plan.
+        status: How the run ended.
+        rows: Rows of the run.
+    """
     import pyarrow as pa
 
     sink = pa.BufferOutputStream()
@@ -52,7 +59,7 @@ def record(place: int, status: Status, rows: pa.Table) -> bytes:
 
 
 def records(path: Path) -> Iterator[tuple[int, Status, pa.Table, int]]:
-    """Place, status, rows, and the offset behind it, of every whole record of a journal."""
+    """Yield index, status, rows and end offset of every complete record of a journal."""
     import pyarrow as pa
 
     data, end = path.read_bytes(), 0
@@ -72,10 +79,10 @@ def records(path: Path) -> Iterator[tuple[int, Status, pa.Table, int]]:
 
 
 def part_statuses(path: Path) -> dict[int, Status]:
-    """Statuses of a part, by place, from its footer alone.
+    """Read the statuses of a part, by index in the plan, from its footer.
 
     Raises:
-        InputError: the file is damaged.
+        InputError: The file is damaged.
     """
     from pyarrow import parquet
 
@@ -86,14 +93,14 @@ def part_statuses(path: Path) -> dict[int, Status]:
 
 
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, CellError, RecursionError, NotImplementedError)
-"""What reading a damaged segment may raise; Arrow's own errors are among them."""
+"""Errors that reading a damaged segment may raise; they include Arrow's own errors."""
 
 
 def _statuses_of(held: Any) -> dict[int, Status]:
-    """Statuses by place of ``[[place, {column: value}], ...]``, every cell checked.
+    """Convert ``[[place, {column: value}], ...]`` to statuses by index, checking every cell.
 
     Raises:
-        CellError: one is not what it is declared to be.
+        CellError: A value violates its declaration.
     """
     places = cells.of_python(_PLACE, [place for place, _ in held])
     cells.check(_PLACE, places)
@@ -111,10 +118,15 @@ def _damaged(path: Path, expected: str) -> InputError:
 
 
 def refuse_double(path: Path, places: Iterable[int], known: Container[int]) -> None:
-    """Refuse runs that another file has already.
+    """Reject runs that another file contains already.
+
+    Args:
+        path: Path of the file.
+        places: Indices of its runs.
+        known: Indices of the runs in other files.
 
     Raises:
-        InputError: it has one.
+        InputError: A run is in both.
     """
     if double := [place for place in places if place in known]:
         raise _damaged(
@@ -123,10 +135,14 @@ def refuse_double(path: Path, places: Iterable[int], known: Container[int]) -> N
 
 
 def segments(folder: Path, ending: str) -> list[Path]:
-    """The files of this ending, in order.
+    """List the segment files with an extension, in order.
+
+    Args:
+        folder: Folder of segments.
+        ending: File extension without dot.
 
     Raises:
-        InputError: one has no number for a name.
+        InputError: The name of a file is not a number.
     """
     paths = sorted(folder.glob(f"*.{ending}"))
     for path in paths:
@@ -136,18 +152,19 @@ def segments(folder: Path, ending: str) -> list[Path]:
 
 
 def finished(folder: Path) -> dict[int, Status]:
-    """Statuses of the finished runs below `folder`, by place, while another process may be at work
-    there.
+    """Read the statuses of the finished runs of a study, by index in the plan.
+
+    Another process may be writing there at the same time.
 
     Raises:
-        InputError: a file is damaged.
+        InputError: A file is damaged.
     """
     return {place: status for _, held in kept(folder) for place, status in held.items()}
 
 
 def kept(folder: Path) -> Iterator[tuple[Path, dict[int, Status]]]:
-    """By file, the statuses of the finished runs below `folder`; see `finished`."""
-    # Journals first: one that becomes a part meanwhile is found among the parts.
+    """Yield the statuses of the finished runs of a study by file; see `finished`."""
+    # Journals first: a journal that becomes a part in the meantime is then found among the parts.
     for path in segments(folder / FOLDER, "journal"):
         with suppress(FileNotFoundError):
             yield path, {place: status for place, status, _, _ in records(path)}
@@ -165,10 +182,10 @@ def write_plan(folder: Path, ids: Sequence[str]) -> None:
 
 
 def read_plan(folder: Path) -> list[str] | None:
-    """The ids of the plan; None where there is none yet.
+    """Read the ids of the plan; None if there is no plan yet.
 
     Raises:
-        InputError: it is damaged.
+        InputError: It is damaged.
     """
     path = folder / FOLDER / PLAN
     try:

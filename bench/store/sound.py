@@ -1,4 +1,4 @@
-"""What must hold between the files of a comparison, and between them and its plan."""
+"""Check the consistency between the files of a comparison, and with its plan."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 
 class Files(NamedTuple):
-    """The files of a comparison whose runs have been written, checked cell by cell.
+    """The files of a comparison with stored runs, checked cell by cell.
 
     Attributes:
-        runs: a line a run; see `bench.store.rows.RunsFile.runs`.
-        statuses: rows of status.csv.
-        training: rows of training.csv.
-        spectra: rows of identifiability.csv; None where there is no such file.
+        runs: One line per run; see `bench.store.rows.RunsFile.runs`.
+        statuses: Rows of status.csv.
+        training: Rows of training.csv.
+        spectra: Rows of identifiability.csv; None if there is no such file.
     """
 
     runs: pd.DataFrame
@@ -40,17 +40,16 @@ class Files(NamedTuple):
 def checked_files(
     folder: Path, experiment: Experiment, *, under_way: bool, plan: list[str] | None = None
 ) -> Files:
-    """Check runs.parquet, status.csv, training.csv and identifiability.csv, and that they tell of
-    the same.
+    """Check runs.parquet, status.csv, training.csv, identifiability.csv and their consistency.
 
     Args:
-        folder: the comparison's.
-        experiment: what was compared.
-        under_way: whether runs may be missing.
-        plan: the id of every run, where it is known.
+        folder: Folder of the comparison.
+        experiment: The experiment.
+        under_way: Whether runs may be missing.
+        plan: The id of every run; None if unknown.
 
     Raises:
-        InputError: something does not hold, in one line.
+        InputError: A check fails; the message is one line.
     """
     remedy = remedy_for(folder, under_way=under_way)
     file = RunsFile(folder / "runs.parquet", remedy)
@@ -86,17 +85,22 @@ def checked_files(
 
 
 def remedy_for(folder: Path, *, under_way: bool) -> str:
-    """What to do with a file of results that is damaged."""
-    if under_way:  # everything is in the segments
+    """Return advice for a damaged file of results.
+
+    Args:
+        folder: Folder of the comparison.
+        under_way: Whether its segments still exist.
+    """
+    if under_way:  # The segments contain everything.
         return f"simgap compare --resume {folder} writes it again"
     return "restore the file, or start a new comparison"
 
 
 def check_table(folder: Path) -> None:
-    """Check table.csv, where there is one.
+    """Check table.csv if it exists.
 
     Raises:
-        InputError: it is damaged.
+        InputError: It is damaged.
     """
     path = folder / "table.csv"
     if path.exists():
@@ -120,21 +124,21 @@ def _spectra(folder: Path, experiment: Experiment, remedy: str) -> pd.DataFrame 
 
 
 def _directions(names: list[str]) -> list[Column]:
-    """Columns of identifiability.csv: all that have no other name are parameters."""
+    """Return the columns of identifiability.csv: all without a declared name are parameters."""
     fixed = [column.name for column in IDENTIFIABILITY]
     return spelled(IDENTIFIABILITY, [name for name in names if name not in fixed], ())
 
 
 def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: Fault) -> None:
-    """Check how runs ended: each stands once, is of the experiment, and within its budget.
+    """Check that statuses are unique, belong to the experiment, and are within its budget.
 
     Args:
-        statuses: columns as `bench.store.schema.STATUS`, cells checked.
-        experiment: what was compared.
-        fault: makes the error for a row of them.
+        statuses: Rows with the columns of `bench.store.schema.STATUS`, cells checked.
+        experiment: The experiment.
+        fault: Makes the error for a row.
 
     Raises:
-        InputError: something does not hold.
+        InputError: A check fails.
     """
     refuse(
         statuses["run"].duplicated(),
@@ -166,7 +170,7 @@ def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: Fault)
         lambda row, says: fault(int(np.flatnonzero(~skipped)[row]), says),
     )
     budgets = {entry.label: entry.budget or experiment.budget for entry in experiment.tuners}
-    budget = statuses["tuner"].map(budgets).astype(np.int64)  # also of none
+    budget = statuses["tuner"].map(budgets).astype(np.int64)  # Also for an empty column.
     used = statuses["simulations"]
     refuse(
         used > budget,
@@ -176,7 +180,7 @@ def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: Fault)
             f"the budget of {statuses['tuner'].iloc[row]}, found {used.iloc[row]}"
         ),
     )
-    # That is what the word says; whoever stops before has converged, or failed.
+    # "done" means that the budget was used; a run that ends earlier has converged or failed.
     refuse(
         (statuses["status"] == "done") & (used != budget),
         fault,
@@ -190,17 +194,17 @@ def check_statuses(statuses: pd.DataFrame, experiment: Experiment, fault: Fault)
 def check_alike(
     runs: pd.DataFrame, file: RunsFile, statuses: pd.DataFrame, fault: Fault, source: str
 ) -> None:
-    """See that rows and statuses tell of the same runs, and the same of them.
+    """Check that rows and statuses describe the same runs consistently.
 
     Args:
-        runs: as `file` gives them.
-        file: of the rows.
-        statuses: how they ended; cells checked.
-        fault: makes the error for a row of them.
-        source: what a message calls where they stand.
+        runs: One line per run, as read from `file`.
+        file: File of the rows.
+        statuses: How they ended; cells checked.
+        fault: Makes the error for a row of the statuses.
+        source: Name of the file of statuses, for messages.
 
     Raises:
-        InputError: something does not hold.
+        InputError: A check fails.
     """
     import pandas as pd
 
@@ -232,10 +236,15 @@ def check_alike(
 
 
 def check_runs(runs: pd.DataFrame, file: RunsFile, experiment: Experiment) -> None:
-    """See that the runs are those of one experiment, each target the same to all.
+    """Check that the runs belong to one experiment, and agree on the parameters of each target.
+
+    Args:
+        runs: One line per run, as read from `file`.
+        file: File of the rows.
+        experiment: The experiment.
 
     Raises:
-        InputError: something does not hold.
+        InputError: A check fails.
     """
 
     def at(i: int, says: str) -> InputError:
@@ -263,20 +272,20 @@ def check_kept(
     plan: Sequence[str] | None,
     remedy: str,
 ) -> pd.DataFrame:
-    """Check the statuses that a part or a journal holds.
+    """Check the statuses that a part or a journal contains.
 
     Args:
-        path: of it.
-        held: by place in the plan.
-        experiment: what is compared.
-        plan: the id of every run; None where it is not known.
-        remedy: what to do where it is damaged.
+        path: Path of the part or journal.
+        held: Statuses by index in the plan.
+        experiment: The experiment.
+        plan: The id of every run; None if unknown.
+        remedy: Advice for a damaged file.
 
     Returns:
-        Them, as rows of status.csv.
+        The statuses as rows of status.csv.
 
     Raises:
-        InputError: something does not hold.
+        InputError: A check fails.
     """
     import pandas as pd
 

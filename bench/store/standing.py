@@ -1,4 +1,4 @@
-"""How far a study is: what making ended with, and what its folder holds."""
+"""Progress of a study: finished, failed and missing runs."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 MISSING = "missing"
-"""The status of what has not been made yet."""
+"""Status of a run that has not been made yet."""
 FINE = ("done", "converged", "made")
-"""Statuses of which there is nothing more to say."""
+"""Statuses of successful runs and shots."""
 
 
 class Made(NamedTuple):
-    """How far a study came when it was made.
+    """Outcome of making a study.
 
     Attributes:
-        finished: how many runs or shots there are.
-        planned: how many there are to be.
-        interrupted: a person stopped it.
-        stopped: what else did, in words.
-        skipped: why it cannot be made on this machine at all.
+        finished: Number of finished runs or shots.
+        planned: Number of planned runs or shots.
+        interrupted: Whether the user stopped it.
+        stopped: Any other reason for which it stopped.
+        skipped: Reason for which it cannot be made on this machine.
     """
 
     finished: int
@@ -38,10 +38,10 @@ class End(NamedTuple):
     """How one run or shot ended.
 
     Attributes:
-        name: its id.
-        group: what it is counted with: its tuner, or its kind of ball.
-        status: as in status.csv; `MISSING` where there is none.
-        reason: in words, a traceback of a crash.
+        name: Its id.
+        group: Its tuner, or its kind of ball, by which runs are counted.
+        status: Status as in status.csv; `MISSING` if there is none.
+        reason: Reason as text; the traceback of a crash.
     """
 
     name: str
@@ -51,14 +51,14 @@ class End(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """What a study's folder holds, while somebody may be at work there.
+    """Progress of a study's folder; another process may be working there.
 
     Attributes:
-        name: of the experiment.
-        what: what is counted, e.g. ``runs finished``.
-        hashes: of what must not change until it is complete, by what a person would call it.
-        ends: of everything that is planned, in the order of the plan.
-        under_way: whether results remain to be written, though everything may have ended.
+        name: Name of the experiment.
+        what: What is counted, e.g. ``runs finished``.
+        hashes: Hashes of what must not change until it is complete, by readable names.
+        ends: How every planned run ended, in the order of the plan.
+        under_way: Whether results remain to be written, although everything may have ended.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Standing(NamedTuple):
 
     @property
     def finished(self) -> int:
-        """How many have ended."""
+        """Number of runs that have ended."""
         return sum(end.status != MISSING for end in self.ends)
 
     @property

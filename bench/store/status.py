@@ -1,4 +1,4 @@
-"""How a run ended."""
+"""Status of a run: how it ended."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ class Status:
     """How a run ended: a row of status.csv.
 
     Attributes:
-        run: its id.
-        tuner: the label of its entry.
-        simulator: registered name.
-        target: name.
-        seed: of the tuner.
+        run: Id of the run.
+        tuner: Label of its tuner.
+        simulator: Registered name of the simulator.
+        target: Name of the target.
+        seed: Seed of the tuner.
         status: done, converged, timeout, crashed, diverged or skipped.
-        reason: why, in words; the traceback of a crash.
-        simulations: used on the target.
-        seconds: wall-clock time.
-        trusted: whether the tuner ran inside the harness.
+        reason: Reason as text; the traceback of a crash.
+        simulations: Number of simulations on the target.
+        seconds: Wall-clock time.
+        trusted: Whether the tuner ran inside the harness.
     """
 
     run: str
@@ -35,11 +35,11 @@ class Status:
 
 
 STATUS_COLUMNS = [field.name for field in fields(Status)]
-"""Of status.csv."""
+"""Columns of status.csv."""
 
 FAILED = ("crashed", "timeout", "diverged")
-"""Ends of a run that was made and delivered nothing one could trust."""
+"""Statuses of runs that were made but gave no usable result."""
 FAILURES = (*FAILED, "skipped")
-"""And of one that was never made: the tables show what is missing."""
+"""Statuses of runs that failed or were never made; tables show their number."""
 STATUSES = ("done", "converged", *FAILURES)
-"""All words by which a run ends."""
+"""All possible statuses of a run."""

@@ -1,4 +1,4 @@
-"""The charts of a comparison; their numbers are those of its tables and printed figures."""
+"""Charts of a comparison, with the same numbers as its tables and printed figures."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from bench.pages.page import Page
 from bench.pages.text import number
 
 _DIGITS = 7
-"""Of numbers that no file beside the page holds."""
+"""Number of significant digits of values that are in no file next to the page."""
 _THIN = 3
-"""Step between the points of a smooth curve that the page holds."""
+"""Step between the stored points of a smooth curve."""
 _MEDIAN = (
     "A line is the median over targets of the recommendation's error (mean over seeds), the band "
     "its 95 % bootstrap interval. Lower and further left is better."
@@ -33,10 +33,18 @@ _BESIDE = "targets"
 
 
 def error_chart(results: Results, page: Page) -> str:
-    """Error against simulations: the main figure."""
+    """Build the main chart: error against simulations.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the chart and its tables are added.
+
+    Returns:
+        HTML of the chart.
+    """
     shown = errors.panels(results.experiment, results.statistics, *results.labels)
     keys = [(panel.metric, panel.kind) for panel in shown]
-    # Where the world is another simulator, the misfit has a figure of its own.
+    # If the targets come from another simulator, the misfit has its own figure.
     if "real" not in results.ranges and "misfit" not in results.pictures:
         keys += [("obs_error", kind) for kind in results.ranges]
     panels = [_against_simulations(results, "errors", *key) for key in keys]
@@ -53,7 +61,15 @@ def error_chart(results: Results, page: Page) -> str:
 
 
 def misfit_chart(results: Results, page: Page) -> str:
-    """What no parameter removes, where targets come from another simulator."""
+    """Build the chart of the misfit, if the targets come from another simulator.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the chart and its tables are added.
+
+    Returns:
+        HTML of the chart; empty without such a figure.
+    """
     if "misfit" not in results.pictures:
         return ""
     keys = [("obs_error", kind) for kind in results.ranges]
@@ -73,7 +89,15 @@ def misfit_chart(results: Results, page: Page) -> str:
 
 
 def directions_chart(results: Results, page: Page) -> str:
-    """Errors along stiff and sloppy directions, and of prediction."""
+    """Build the chart of errors along stiff and sloppy directions, and of prediction.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the chart and its tables are added.
+
+    Returns:
+        HTML of the chart; empty without such a figure.
+    """
     metrics = directional(results.experiment, results.stored.runs)
     if "directions" not in results.pictures:
         return ""
@@ -92,7 +116,15 @@ def directions_chart(results: Results, page: Page) -> str:
 
 
 def distance_chart(results: Results, page: Page) -> str:
-    """Error against the target's distance from the training range."""
+    """Build the chart of the error against the target's distance from the training range.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the chart and its tables are added.
+
+    Returns:
+        HTML of the chart; empty without such a figure.
+    """
     if "distance" not in results.pictures:
         return ""
     table = results.statistics.distances
@@ -129,7 +161,15 @@ def distance_chart(results: Results, page: Page) -> str:
 
 
 def runtime_chart(results: Results, page: Page) -> str:
-    """Runtime distributions over all thresholds."""
+    """Build the chart of runtime distributions over all thresholds.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the chart and its tables are added.
+
+    Returns:
+        HTML of the chart.
+    """
     table = results.statistics.shares
     page.table("runtime", table, _DIGITS)
     panels = []
@@ -151,7 +191,15 @@ def runtime_chart(results: Results, page: Page) -> str:
 
 
 def ert_chart(results: Results, page: Page) -> str:
-    """Expected running time against the error that is to be reached."""
+    """Build the chart of the expected running time against the error to be reached.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the chart is added.
+
+    Returns:
+        HTML of the chart.
+    """
     table = results.tables["ert"]
     panels = []
     for kind in results.ranges:
@@ -168,7 +216,15 @@ def ert_chart(results: Results, page: Page) -> str:
 
 
 def cost_chart(results: Results, page: Page) -> str:
-    """Seconds for a target by the cost of a simulation, and who wins at which."""
+    """Build the chart of seconds per target by the cost of a simulation, with the winners.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the chart and its tables are added.
+
+    Returns:
+        HTML of the chart.
+    """
     parts, panels = [], []
     wins = results.tables["who_wins"]
     for level in _levels(results):
@@ -200,7 +256,15 @@ def cost_chart(results: Results, page: Page) -> str:
 
 
 def amortisation_chart(results: Results, page: Page) -> str:
-    """From how many targets on a training pays."""
+    """Build the chart of the number of targets from which on a training pays.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the chart and its tables are added.
+
+    Returns:
+        HTML of the chart; empty without such a figure.
+    """
     if "amortisation" not in results.pictures:
         return ""
     evens = placed_even(results.tables["break_even"])
@@ -247,13 +311,13 @@ def amortisation_chart(results: Results, page: Page) -> str:
 def _shown(
     results: Results, page: Page, chart: Chart, same: Mapping[str, str] = MappingProxyType({})
 ) -> str:
-    """Add a chart to the page; its legend says whose runs failed and which curves coincide.
+    """Add a chart to the page; its legend notes failed runs and coinciding curves.
 
     Args:
-        results: of the comparison.
-        page: the page.
-        chart: without notes.
-        same: which curve coincides with which, by tuner.
+        results: Results of the comparison.
+        page: The page.
+        chart: Chart without notes.
+        same: Text about coinciding curves, by tuner.
     """
     failed = results.statistics.notes
     names = dict.fromkeys((*failed, *same))
@@ -280,7 +344,7 @@ def _against_simulations(
         results, kind, table, "simulations", lines, _simulations(results), _log(f"{label}, median")
     )
     facets = {**panel.facets, "error": label}
-    # Of a recording there is one range, and panels differ in their runs.
+    # A recording has one range only; its panels differ in the runs.
     title = f"{label} ({results.count(kind)} starting points)" if kind == "real" else panel.title
     floor = results.statistics.floor_of(metric)
     if floor is not None:
@@ -298,13 +362,13 @@ def _panel(
     up: Axis,
     spans: tuple[Span, ...] = (),
 ) -> Panel:
-    """A panel of one range of targets."""
+    """Build a panel of one range of targets."""
     title = f"{TITLES[kind]} ({results.count(kind)} {'starts' if kind == 'real' else 'targets'})"
     return Panel(title, table, x, lines, across, up, {_BESIDE: TITLES[kind]}, spans=spans)
 
 
 def _with(panel: Panel, results: Results, level: float) -> Panel:
-    """A panel that is one of several levels of the error."""
+    """Add the error threshold to a panel's facets."""
     reached = f"{number(level)}{_in_widths(results)}"
     return replace(panel, facets={**panel.facets, "error reached": reached})
 
@@ -318,7 +382,7 @@ def _lines(
     high: str = "",
     **where: str,
 ) -> tuple[Series, ...]:
-    """A series for each tuner of a table."""
+    """Make a series for each tuner of a table."""
     return tuple(
         Series(name, y, drawn, {"tuner": name, **where}, low, high, draw)
         for name, drawn in results.looks(table["tuner"])
@@ -326,12 +390,12 @@ def _lines(
 
 
 def _thinned(table: pd.DataFrame, step: int) -> pd.DataFrame:
-    """Every so many of the rows of each range and tuner."""
+    """Keep every `step`-th row of each range and tuner."""
     return table[table.groupby(["range", "tuner"]).cumcount() % step == 0]
 
 
 def _levels(results: Results) -> list[float]:
-    """Errors that have prices: the one that printed figures show comes first."""
+    """List the error thresholds with costs, beginning with the one of printed figures."""
     first = results.statistics.level
     return [first, *(level for level in results.statistics.prices if level != first)]
 
@@ -353,5 +417,5 @@ def _log(label: str) -> Axis:
 
 
 def _filled(panels: Sequence[Panel]) -> tuple[Panel, ...]:
-    """Those in which there is something to draw; at least one, for its axes say what is missing."""
+    """Select the panels with data; at least one, since its axes show what is missing."""
     return tuple(panel for panel in panels if panel.series) or tuple(panels[:1])

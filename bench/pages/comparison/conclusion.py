@@ -1,4 +1,4 @@
-"""Headline of a comparison's page, and what limits its results."""
+"""Headline sentences and warnings of a comparison's report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ SURE = SIGNIFICANCE
 
 
 def best_table(results: Results) -> str:
-    """The best tuners after 1, 3, 10 and all simulations, a column for each range; safe HTML."""
+    """Build a table of the best tuners after 1, 3, 10 and all simulations; safe HTML.
+
+    The table has a column for each range.
+    """
     columns = [headline.standings(results.statistics, kind) for kind in results.ranges]
     if not all(columns):
         return ""
@@ -33,12 +36,12 @@ def best_table(results: Results) -> str:
 
 
 def conclusion(results: Results) -> list[str]:
-    """Which tuners are worse than the best after all simulations in each range; safe HTML."""
+    """List the tuners that are worse than the best after all simulations, by range; safe HTML."""
     return [_of_range(results, kind) for kind in results.ranges]
 
 
 def standing_tables(results: Results) -> str:
-    """For each range a table of the tuners that are best, worse and not decided; safe HTML."""
+    """Build a table of best, worse and undecided tuners for each range; safe HTML."""
     label = results.label(results.shown_metric)
     parts = []
     for kind in results.ranges:
@@ -53,7 +56,7 @@ def standing_tables(results: Results) -> str:
             for one in headline.standings(results.statistics, kind)
         ]
         heads = ["-simulations", "best (median error)", "worse", "not decided", "all runs failed"]
-        # Most often nothing failed: the column would be empty.
+        # Usually nothing failed, and the column would be empty.
         width = len(heads) if any(row[-1] for row in rows) else len(heads) - 1
         title = f"{_where(results, kind)}: {label}; {headline.floor_text(results.statistics)}"
         how = headline.how_decided(results.statistics, kind)
@@ -65,7 +68,7 @@ def standing_tables(results: Results) -> str:
 
 
 def _best(one: headline.Standing) -> str:
-    """The best tuners with their median error."""
+    """Format the best tuners with their median error."""
     return f"{_named(one.best, strong)} ({safe(one.error)})" if one.best else "every run failed"
 
 
@@ -74,7 +77,7 @@ def _of_range(results: Results, kind: str) -> str:
     if not found:
         return f"{where}: no target has an error that decides."
     last = found[-1]
-    # The first one explains the others.
+    # The wording of the first one explains the format of the others.
     first = [
         re.sub(r" (\d\S*x) \((\d+)/(\d+)\)$", r" \1 the error (larger on \2 of \3 targets)", one)
         for one in last.worse[:1]
@@ -94,7 +97,7 @@ def _where(results: Results, kind: str) -> str:
 
 
 def reaching(results: Results) -> list[str]:
-    """How soon the best tuners of each range reach an error for good; safe HTML."""
+    """Describe how soon the best tuners of each range reach an error permanently; safe HTML."""
     said = ((_where(results, kind), _reaching(results, kind)) for kind in results.ranges)
     return [f"{where}: {text}" for where, text in said if text]
 
@@ -125,7 +128,7 @@ def _reaching(results: Results, kind: str) -> str:
 
 
 def _unit(results: Results) -> str:
-    """The unit of the error that decides."""
+    """Return the unit of the deciding error."""
     metric = results.statistics.metric
     if metric in ("param_error", "stiff_error"):
         return " training widths"
@@ -143,13 +146,13 @@ def _training(results: Results, line: Mapping[Any, Any]) -> str:
 
 
 def _named(names: Sequence[str], mark: Callable[[str], str] = str) -> str:
-    """Names as safe HTML, each marked."""
+    """Format names as safe HTML, with a mark-up function for each."""
     shown = [mark(safe(name, 100)) for name in names]
     return joined(shown)
 
 
 def warnings(results: Results) -> Iterator[str]:
-    """What limits the results; safe HTML."""
+    """Yield warnings about limitations of the results; safe HTML."""
     few = (headline.too_few(results.statistics, kind) for kind in results.ranges)
     yield from dict.fromkeys(safe(text) for text in few if text)
     if results.missing:
@@ -166,7 +169,7 @@ def warnings(results: Results) -> Iterator[str]:
 
 
 def redraws_text(results: Results) -> str:
-    """How many targets were drawn again, as plain text; empty for none."""
+    """Describe how many targets were drawn again, as plain text; empty for none."""
     redrawn, draws = (
         results.environment.get(key, 0) for key in ("redrawn_targets", "target_draws")
     )
@@ -180,7 +183,7 @@ def redraws_text(results: Results) -> str:
 
 
 def marks(results: Results) -> Iterator[str]:
-    """How targets and runs were made, where that limits what they say."""
+    """Yield notes on isolation, salt and targets that limit the results."""
     if results.experiment.trusted:
         yield "Trusted: the tuners ran inside the harness, where nothing is out of their reach."
     if not results.experiment.salt_sha256:

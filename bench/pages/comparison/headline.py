@@ -1,4 +1,4 @@
-"""Who is best after 1, 3, 10 and all simulations, in words for the terminal and the page."""
+"""Sentences about the best tuners after 1, 3, 10 and all simulations, for terminal and page."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from bench.analysis.tuner_ranking import (
 from bench.pages.text import number
 
 _DIGITS = 2
-"""Significant digits of factors."""
+"""Number of significant digits of factors."""
 WHERE = {
     "in": "targets in the training range",
     "wide": "targets anywhere in the bounds",
     "real": "the recording",
 }
-"""Ranges of targets."""
+"""Wording for the ranges of targets."""
 
 
 class Standing(NamedTuple):
-    """The tuners of one range after some number of simulations.
+    """Verdicts on the tuners of one range after some number of simulations.
 
     Attributes:
-        simulations: number of simulations.
-        best: tuners that share the smallest error.
-        error: the median error of the best, in words.
-        worse: those that the test calls worse, each with factor and number of targets.
-        undecided: those with a larger median error of which the test decides nothing.
-        failed: those all of whose runs failed.
+        simulations: Number of simulations.
+        best: Tuners that share the smallest error.
+        error: Median error of the best tuners, as text.
+        worse: Tuners that are significantly worse, each with factor and number of targets.
+        undecided: Tuners with a larger median error whose difference is not significant.
+        failed: Tuners all of whose runs failed.
     """
 
     simulations: int
@@ -50,7 +50,12 @@ class Standing(NamedTuple):
 
 
 def standings(statistics: Statistics, kind: str) -> list[Standing]:
-    """The standing after 1, 3, 10 and all simulations in one range."""
+    """List the verdicts after 1, 3, 10 and all simulations in one range.
+
+    Args:
+        statistics: Statistics of the comparison.
+        kind: Range of the targets.
+    """
     ranking = _in_range(statistics, kind)
     return [
         _standing(statistics, k, ranking[ranking["simulations"] == k])
@@ -66,7 +71,7 @@ def _standing(statistics: Statistics, k: int, part: pd.DataFrame) -> Standing:
     def named(*verdicts: str) -> pd.DataFrame:
         return part[part["verdict"].isin(verdicts)]
 
-    # Equal tuners stand in the order of legends, so that a page has one order.
+    # Equal tuners are in the order of legends, so that a page has one order.
     best = sorted(named(BEST, EQUAL)["tuner"], key=statistics.order.index)
     first = named(BEST)
     return Standing(
@@ -87,7 +92,7 @@ def _error(statistics: Statistics, median: float) -> str:
 
 
 def _worse(row: dict[Any, Any]) -> str:
-    """``cma_es 5.8x (8/10)``."""
+    """Format a worse tuner, e.g. ``cma_es 5.8x (8/10)``."""
     ratio = float(row["error_ratio"])
     factor = f" {number(ratio, _DIGITS)}x" if ratio > 1.0 else ""
     # A failed run has an infinite error.
@@ -96,21 +101,31 @@ def _worse(row: dict[Any, Any]) -> str:
 
 
 def targets_text(statistics: Statistics, kind: str) -> str:
-    """The number of targets of a range: ``10 targets``, or how many of them decide."""
+    """Format the number of targets of a range: ``10 targets``, or how many of them decide.
+
+    Args:
+        statistics: Statistics of the comparison.
+        kind: Range of the targets.
+    """
     count, ranked = statistics.targets[kind], _in_range(statistics, kind)["targets"]
     deciding = int(ranked.max()) if len(ranked) else 0
     things = ("starting point" if kind == "real" else "target") + "s" * (count != 1)
-    # Targets whose data identify no direction have no error that decides.
+    # Targets whose data identify no direction have no deciding error.
     return f"{count} {things}" if deciding == count else f"{deciding} of {count} {things} decide"
 
 
 def floor_text(statistics: Statistics) -> str:
-    """Which errors count as equal."""
+    """State which errors count as equal."""
     return f"errors below {statistics.floor * statistics.unit:.2g} count as equal"
 
 
 def how_decided(statistics: Statistics, kind: str) -> str:
-    """How the ranking is tested and how to read it."""
+    """Explain the test of the ranking and the notation.
+
+    Args:
+        statistics: Statistics of the comparison.
+        kind: Range of the targets.
+    """
     others = _others(statistics, kind)
     if not others:
         return ""
@@ -122,13 +137,18 @@ def how_decided(statistics: Statistics, kind: str) -> str:
 
 
 def _others(statistics: Statistics, kind: str) -> int:
-    """Number of tuners that the best one is tested against."""
+    """Return the number of tuners that the best one is tested against."""
     part = _in_range(statistics, kind)
     return max(part.loc[part["verdict"] != FAILED, "tuner"].nunique() - 1, 0)
 
 
 def too_few(statistics: Statistics, kind: str) -> str:
-    """What is said where so few targets can decide nothing; empty where they can."""
+    """Warn if there are too few targets for any significant difference; empty otherwise.
+
+    Args:
+        statistics: Statistics of the comparison.
+        kind: Range of the targets.
+    """
     ranked, others = _in_range(statistics, kind)["targets"], _others(statistics, kind)
     if not others or int(ranked.max()) >= (needed := targets_needed(others)):
         return ""
@@ -140,7 +160,12 @@ def too_few(statistics: Statistics, kind: str) -> str:
 
 
 def failed_runs(statistics: Statistics, kind: str) -> str:
-    """Tuners some of whose runs failed in a range, with their numbers; empty for none."""
+    """List the tuners with failed runs in a range and their numbers; empty for none.
+
+    Args:
+        statistics: Statistics of the comparison.
+        kind: Range of the targets.
+    """
     part = _in_range(statistics, kind).drop_duplicates("tuner")
     each = [
         f"{row['tuner']} {row['failures']} of {row['runs']}"

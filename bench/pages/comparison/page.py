@@ -1,4 +1,4 @@
-"""The page of one comparison: report.html."""
+"""Assemble the page of one comparison, report.html."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bench.pages.page import Page
 
 
 def comparison_page(results: Results) -> str:
-    """The page as HTML: who wins where comes first, then what it rests on, then how it was made."""
+    """Build the page as HTML: results first, then the evidence, then how it was made."""
     name = results.experiment.title or results.experiment.name
     made = f"Made by {code('simgap')} from the runs in {code(safe(results.folder, 300))}."
     page = Page(f"{name}: comparison of tuners", made)

@@ -1,4 +1,4 @@
-"""What stands below the charts: tables, failures, and how all of it was made."""
+"""Sections below the charts: tables, failures, and how the results were made."""
 
 from __future__ import annotations
 
@@ -17,13 +17,20 @@ from bench.problem.identifiability import STIFF
 from bench.store.status import FAILURES
 
 _MOST = 20
-"""Reasons of failures that are shown whole."""
+"""Maximum number of failure reasons that are shown completely."""
 _LONG = 6000
-"""Letters of a reason."""
+"""Maximum length of a reason in characters."""
 
 
 def table_grid(results: Results, page: Page) -> str:
-    """table.csv, at first the error that decides at the end of the budget, the best tuner first."""
+    """Build the grid of table.csv.
+
+    It initially shows the deciding error at the end of the budget, the best tuner first.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the table is added.
+    """
     table = results.tables["table"]
     page.table("table", table)
     metric = results.statistics.metric
@@ -53,7 +60,12 @@ def table_grid(results: Results, page: Page) -> str:
 
 
 def ert_grid(results: Results, page: Page) -> str:
-    """ert.csv."""
+    """Build the grid of ert.csv.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the table is added.
+    """
     page.table("ert", results.tables["ert"])
     columns = (
         Column("tuner"),
@@ -74,7 +86,12 @@ def ert_grid(results: Results, page: Page) -> str:
 
 
 def pairs_grid(results: Results, page: Page) -> str:
-    """pairs.csv."""
+    """Build the grid of pairs.csv; empty without pairs.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the table is added.
+    """
     table = results.tables["pairs"]
     if table.empty:
         return ""
@@ -95,7 +112,12 @@ def pairs_grid(results: Results, page: Page) -> str:
 
 
 def wins_grid(results: Results, page: Page) -> str:
-    """who_wins.csv."""
+    """Build the grid of who_wins.csv.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the table is added.
+    """
     page.table("who_wins", results.tables["who_wins"])
     columns = (
         Column("range"),
@@ -109,7 +131,12 @@ def wins_grid(results: Results, page: Page) -> str:
 
 
 def even_grid(results: Results, page: Page) -> str:
-    """break_even.csv."""
+    """Build the grid of break_even.csv; empty without rows.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the table is added.
+    """
     table = results.tables["break_even"]
     if table.empty:
         return ""
@@ -130,7 +157,12 @@ def even_grid(results: Results, page: Page) -> str:
 
 
 def spectra(results: Results, page: Page) -> str:
-    """What the data of each target can know."""
+    """Build the section on what the data of each target identify; empty without the figure.
+
+    Args:
+        results: Results of the comparison.
+        page: Page, to which the figure is added.
+    """
     still = results.still("spectra", "1 sigma of each direction, and the parameters in it.")
     if still is None:
         return ""
@@ -142,7 +174,7 @@ def spectra(results: Results, page: Page) -> str:
 
 
 def failures(results: Results) -> Iterator[str]:
-    """Every kind of failure with its first reason whole."""
+    """Yield every kind of failure with its first reason in full."""
     statuses = results.stored.statuses
     failed = statuses[statuses["status"].isin(FAILURES)]
     if failed.empty:
@@ -162,17 +194,17 @@ def failures(results: Results) -> Iterator[str]:
 
 
 def _whole(text: str) -> str:
-    """A text of several lines, as it stands."""
+    """Format a text of several lines with its indentation."""
     cut = text if len(text) <= _LONG else f"{text[:_LONG]} …"
     lines = [safe(line, 1000) for line in cut.strip("\n").replace("\t", "    ").split("\n")]
-    # Leading spaces are lost to `safe`, which cleans both ends.
+    # `safe` strips leading spaces, so they are added again.
     indents = [len(line) - len(line.lstrip()) for line in cut.strip("\n").split("\n")]
     body = "\n".join(" " * indent + line for indent, line in zip(indents, lines, strict=True))
     return f"<pre>{body}</pre>"
 
 
 def seconds(results: Results) -> str:
-    """What the comparison took: a table of means by tuner."""
+    """Build a table of mean seconds by tuner."""
     table = results.tables["table"]
     last = table[table["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
     last = last.reindex([t for t in results.statistics.order if t in last.index])
@@ -190,7 +222,7 @@ def seconds(results: Results) -> str:
 
 
 def making(results: Results) -> Iterator[str]:
-    """The command that makes it again, the configuration, the machine."""
+    """Yield the command that repeats the comparison, the configuration, and the machine."""
     yield paragraph("The same runs again, with the targets that were met here:")
     yield f"<pre>{safe(again(results), 1000)}</pre>"
     yield paragraph(
@@ -205,7 +237,7 @@ def making(results: Results) -> Iterator[str]:
 
 
 def again(results: Results) -> str:
-    """The command that makes the same comparison."""
+    """Return the command that repeats the comparison."""
     source = shlex.quote(f"{results.folder}/experiment.toml")
     plugins = [f" --plugin {shlex.quote(p)}" for p in results.environment.get("plugins", ())]
     return f"simgap compare {source}{''.join(plugins)}"

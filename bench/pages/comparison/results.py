@@ -1,4 +1,4 @@
-"""What the page of a comparison is made from."""
+"""Data from which the page of a comparison is rendered."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from bench.store.folder import Stored
 
 @dataclass(frozen=True)
 class Results:
-    """A comparison as its page tells it.
+    """A comparison, as shown on its page.
 
     Attributes:
-        stored: what lies in its folder.
-        labels: of its axes.
-        statistics: behind its tables and figures.
-        tables: by name, as they are written beside the page.
-        pictures: its figures by name, as they are printed.
-        environment: what environment.json says.
-        folder: where it lies, as it was named.
-        configuration: the text of experiment.toml.
-        missing: runs that are planned and not made yet.
+        stored: Content of its folder.
+        labels: Axis labels.
+        statistics: Statistics for tables and figures.
+        tables: Tables by name, as written next to the page.
+        pictures: Printed figures by name.
+        environment: Content of environment.json.
+        folder: Its folder, as named by the user.
+        configuration: Text of experiment.toml.
+        missing: Number of planned runs that have not been made yet.
     """
 
     stored: Stored
@@ -46,36 +46,36 @@ class Results:
 
     @property
     def experiment(self) -> Experiment:
-        """What was compared."""
+        """The experiment that was run."""
         return self.stored.experiment
 
     @property
     def ranges(self) -> list[str]:
-        """Ranges of which there are runs, in the experiment's order."""
+        """Ranges that have runs, in the experiment's order."""
         return [kind for kind in self.experiment.ranges if kind in self.statistics.targets]
 
     @cached_property
     def style(self) -> Styles:
-        """Looks of the tuners, and their order by the error that decides."""
+        """Styles of the tuners, and their order by the deciding error."""
         return style_of(self.experiment, self.statistics)
 
     def looks(self, present: pd.Series[Any]) -> list[tuple[str, Look]]:
-        """The tuners of a column, best first, each with its look."""
+        """Return the tuners of a column, best first, each with its style."""
         there = set(present)
         return [(name, self.style.look(name)) for name in self.style.order if name in there]
 
     def count(self, kind: str) -> int:
-        """Targets of a range; of a recording, starting points."""
+        """Return the number of targets of a range; for a recording, of starting points."""
         return self.statistics.targets[kind]
 
     @property
     def shown_metric(self) -> str:
-        """The error that decides; of one parameter in its own unit."""
+        """The deciding error; for a single parameter in its own unit."""
         metric = self.statistics.metric
         return self.statistics.parameter_metric if metric == "param_error" else metric
 
     def label(self, metric: str) -> str:
-        """What an error is called on an axis."""
+        """Return the axis label of an error."""
         channel = self.labels.channel
         real = "real" in self.experiment.ranges
         return {
@@ -89,11 +89,11 @@ class Results:
         }[metric]
 
     def still(self, name: str, shows: str) -> Static | None:
-        """A figure as it is printed; None where it was not drawn.
+        """Return the printed version of a figure; None if it was not drawn.
 
         Args:
-            name: of the figure.
-            shows: what, for those who do not see it.
+            name: Name of the figure.
+            shows: Text description for readers who cannot see it.
         """
         if name not in self.pictures:
             return None

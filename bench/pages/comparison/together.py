@@ -1,4 +1,4 @@
-"""The page of several comparisons together: report.html of `simgap plot A B --out DIR`."""
+"""HTML report over several comparisons: report.html of `simgap plot A B --out DIR`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bench.problem.experiment import Experiment
 from sims.base import Array
 
 _DIGITS = 7
-"""Of numbers that no file beside the page holds."""
+"""Number of significant digits of values that are in no file next to the page."""
 _ACROSS = "simulations used on the target"
 _LABELS = {
     "param_error": "mean parameter error [training widths], median",
@@ -34,19 +34,19 @@ _LABELS = {
 
 @dataclass(frozen=True)
 class Several:
-    """Several comparisons as their page tells them.
+    """Several comparisons, as shown on their page.
 
     Attributes:
-        parts: experiment and statistics of each.
-        tuners: that all have.
-        ranked: ranks, a row a problem, a column a tuner, 1 is best.
-        p_values: Nemenyi's, of each pair of tuners; None without enough problems.
-        friedman: p-value of Friedman's test; NaN likewise.
-        shares: by tuner, reached after 0, 1, 2, ... hundredths of each problem's budget.
-        tables: by name, as they are written beside the page.
-        pictures: its figures by name, as they are printed.
-        folders: where the comparisons lie.
-        out: where the page lies.
+        parts: Experiment and statistics of each comparison.
+        tuners: Tuners that all comparisons have.
+        ranked: Ranks, one row per problem, one column per tuner; 1 is best.
+        p_values: P-values of Nemenyi's test of each pair of tuners; None without enough problems.
+        friedman: P-value of Friedman's test; NaN without enough problems.
+        shares: By tuner, the share reached after 0, 1, 2, ... hundredths of each problem's budget.
+        tables: Tables by name, as written next to the page.
+        pictures: Printed figures by name.
+        folders: Folders of the comparisons.
+        out: Folder of the page.
     """
 
     parts: Sequence[tuple[Experiment, Statistics]]
@@ -61,14 +61,14 @@ class Several:
     out: str
 
     def looks(self) -> list[tuple[str, Look]]:
-        """The tuners, the best mean rank first, each with its look."""
+        """Return the tuners, best mean rank first, each with its style."""
         order = self.ranked.mean().sort_values(kind="stable").index
         places = {name: place for place, name in enumerate(self.tuners)}
         return [(str(name), look(places[str(name)])) for name in order]
 
 
 def together_page(several: Several) -> str:
-    """The page as HTML: who is best over all problems, then each problem."""
+    """Build the page as HTML: results over all problems first, then each problem."""
     count = len(several.ranked)
     page = Page(f"{count} problems together: comparison of tuners", f"Made by {code('simgap')}.")
     page.add(f"<header>\n<h1>{len(several.tuners)} tuners on {count} problems</h1>")
@@ -145,7 +145,7 @@ def _difference(several: Several, page: Page) -> str:
 
 
 def _errors(several: Several, page: Page) -> str:
-    """Error against simulations, a panel a problem; one shows at a time."""
+    """Build the chart of error against simulations, with one panel per problem."""
     frames, panels = [], []
     met: Counter[str] = Counter()
     for experiment, statistics in several.parts:
@@ -157,7 +157,7 @@ def _errors(several: Several, page: Page) -> str:
             medians = medians[medians["tuner"].isin(several.tuners)]
             problem = f"{experiment.name} {kind}"
             met[problem] += 1
-            # The same experiment twice: its curves must not be mixed.
+            # If an experiment is given twice, its curves must not be mixed.
             problem += f", {met[problem]}" if met[problem] > 1 else ""
             frames.append(medians.assign(problem=problem, metric=metric))
             across = Axis(_ACROSS, "symlog", ("symlog", "linear"), ticks, ends=ends)
