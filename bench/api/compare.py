@@ -401,7 +401,7 @@ class Compared:
 
     @property
     def _in_files(self) -> bool:
-        """Whether tables and figures are only available as files in the folder."""
+        """True if tables and figures are only available as files in the folder."""
         asked = self.experiment
         return bool(asked.shot or asked.calibration or asked.diagnosis)
 

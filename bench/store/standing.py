@@ -30,12 +30,12 @@ class Made(NamedTuple):
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is missing."""
+        """True if nothing is missing."""
         return self.finished == self.planned
 
 
 class End(NamedTuple):
-    """How one run or shot ended.
+    """Status of one run or shot.
 
     Attributes:
         name: Its id.
@@ -74,5 +74,5 @@ class Standing(NamedTuple):
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is missing."""
+        """True if nothing is missing."""
         return not self.under_way and self.finished == len(self.ends)

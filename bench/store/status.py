@@ -1,4 +1,4 @@
-"""Status of a run: how it ended."""
+"""Final status of a run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 @dataclass(frozen=True)
 class Status:
-    """How a run ended: a row of status.csv.
+    """Status of a run: a row of status.csv.
 
     Attributes:
         run: Id of the run.
