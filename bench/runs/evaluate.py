@@ -64,7 +64,7 @@ class Evaluator:
         return observations, losses
 
     def _one_loss(self, observations: Array) -> Array:
-        """Compute the loss (1,) of one observation with one channel and one sample set.
+        """Compute the loss (1,) of one observation of one channel without missing samples.
 
         Most evaluations are of this kind, and this takes a third of the time of the general case.
         """

@@ -211,7 +211,8 @@ class LocalPool:
         """Iterate over the results of calls in the order in which they end.
 
         A call that exceeds its limit gives a `TimeoutError`. A call whose worker dies gives a
-        `DeathError`, if the kill is external (by the kernel or a user) after `RETRIES` repetitions.
+        `DeathError`; if the worker was killed externally (by the kernel or a user), only after
+        `RETRIES` repetitions.
 
         Args:
             calls: functions with their arguments.
