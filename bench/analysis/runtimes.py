@@ -32,7 +32,7 @@ LEVELS = (0.1, 0.01, 1e-3, 1e-4, 1e-6)
 def thresholds(curves: Curves, simulated: bool) -> tuple[Array, tuple[float, ...]]:
     """Choose thresholds of the runtime distribution and of the ERT table.
 
-    For a recording, they lie between the median initial error and the smallest final error.
+    For a recording, they are between the median initial error and the smallest final error.
 
     Args:
         curves: values of the deciding metric.

@@ -29,7 +29,7 @@ class Ground(Protocol):
         """Draw the scenarios of one target."""
 
     def scene(self, scenarios: Sequence[Scenario]) -> Scene:
-        """Return what tuners are told about these scenarios."""
+        """Return the scenario information that tuners get."""
 
     def simulate(self, points: Array, scenarios: tuple[Scenario, ...]) -> Array:
         """Simulate points of the unit cube.

@@ -150,7 +150,7 @@ class Problem:
         return (targets.scenario(experiment, rng, experiment.initial, experiment.inputs),)
 
     def scene(self, scenarios: Sequence[Scenario]) -> Scene:
-        """Return what tuners are told about scenarios: initial values, constants and inputs.
+        """Return the scenario information for tuners: initial values, constants and inputs.
 
         An initial value of an observed channel is left out, because it is the first sample.
         """
