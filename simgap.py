@@ -1,6 +1,7 @@
-"""simgap compares methods that tune a simulator's parameters, and explains what tuning cannot fix.
+"""Compare methods that tune a simulator's parameters, and explain what tuning cannot fix.
 
-The one name for users and for authors of plugins, in a script, a notebook and a test::
+This module has all public names for users and for authors of plugins, in a script, a notebook and a
+test::
 
     import simgap
 
@@ -10,7 +11,7 @@ The one name for users and for authors of plugins, in a script, a notebook and a
 
     from simgap import Tuner, Force, Friction, Parameter, Channel, OwnSimulator, InputError
 
-Nothing is imported before it is asked for; `dir(simgap)` lists what there is.
+Names are imported when they are first used; `dir(simgap)` lists them.
 """
 
 from __future__ import annotations
@@ -72,24 +73,20 @@ _WHERE = {
         "System",
     ),
 }
-"""Where each public name lives; simgap.pyi says the same to type checkers, and a test compares."""
+"""Public names by module; simgap.pyi declares the same for type checkers, and a test compares."""
 _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
 __all__ = sorted([*_MODULE_OF, "main"])
 
 
 def _hidden_package() -> str:
-    """Say which file or folder would be imported in place of one of simgap's own packages.
-
-    Returns:
-        One line with its path and what to do; empty if simgap's packages are found.
-    """
-    # Two, since an installer may link each file to a cache (uv's link mode "symlink").
+    """Return a message if a file or folder hides one of simgap's own packages."""
+    # There are two, because an installer may link each file to a cache (uv's mode "symlink").
     homes = {realpath(dirname(abspath(__file__))), dirname(realpath(__file__))}
     for name in ("bench", "methods", "sims"):
         module = sys.modules.get(name)
         spec = PathFinder.find_spec(name) if module is None else getattr(module, "__spec__", None)
         if module is None and spec is None:
-            continue  # another finder has it, as in an editable install
+            continue  # another finder provides it, as in an editable install
         folders = list(spec.submodule_search_locations or ()) if spec is not None else []
         file = getattr(module, "__file__", None) or (spec.origin if spec is not None else None)
         for place in map(realpath, folders or [file or "<a module without a file>"]):
@@ -110,7 +107,7 @@ if _hidden := _hidden_package():
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line, and return the exit code."""
     from bench.cli import main as run
 
     return run(arguments)
@@ -120,7 +117,7 @@ def __getattr__(name: str) -> object:
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'simgap' has no attribute {name!r}")
     value = getattr(import_module(_MODULE_OF[name]), name)
-    globals()[name] = value  # the next time it is found without asking
+    globals()[name] = value  # the next access finds the name without this function
     return value
 
 

@@ -1,3 +1,3 @@
-"""The harness of simgap: compares tuners, and explains what tuning cannot fix."""
+"""Benchmark of tuners and diagnosis of simulators."""
 
 __version__ = "0.1.0"

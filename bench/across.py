@@ -1,6 +1,4 @@
-"""Several comparisons together: ranks over problems, a joint runtime distribution, ERT and pairs of
-each.
-"""
+"""Joint statistics over several comparisons: mean ranks, runtime distribution, ERT and pairs."""
 
 from __future__ import annotations
 
@@ -32,22 +30,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _TUNERS = 3
-"""Tuners that Friedman's test needs at least."""
+"""Minimum number of tuners for Friedman's test."""
 
 
 class Across(NamedTuple):
-    """What several comparisons have given together.
+    """Result of evaluating several comparisons together.
 
     Attributes:
-        together: they.
-        files: what was written.
+        together: comparisons.
+        files: files that were written.
     """
 
     together: Together
     files: list[Path]
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Return the result as a JSON document."""
         ranked = self.together.ranked
         return {
             "problems": list(ranked.index),
@@ -60,8 +58,12 @@ class Across(NamedTuple):
 
 
 def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> Across:
-    """Statistics over several comparisons: ranks over problems, joint runtime distribution, ERT and
-    pairs of each.
+    """Compute joint statistics of several comparisons, and write tables, figures and a page.
+
+    Args:
+        folders: result folders of the comparisons.
+        out: folder to write to.
+        say: callback that prints one line.
 
     Raises:
         InputError: a folder is not that of a comparison, or they share no tuners.
@@ -90,7 +92,7 @@ def across(folders: Sequence[Path], out: Path, say: Callable[[str], None]) -> Ac
 
 
 def read_together(folders: Sequence[Path]) -> Together:
-    """Read several comparisons.
+    """Load several comparisons.
 
     Raises:
         InputError: a folder is not that of a comparison, or they share no tuners.
@@ -110,7 +112,12 @@ def read_together(folders: Sequence[Path]) -> Together:
 
 @dataclass(frozen=True)
 class Part:
-    """One of the comparisons: its statistics, and what was asked for."""
+    """One of several comparisons.
+
+    Attributes:
+        statistics: statistics of the comparison.
+        experiment: configuration of the comparison.
+    """
 
     statistics: Statistics
     experiment: Experiment
@@ -121,8 +128,8 @@ class Together:
     """Several comparisons.
 
     Attributes:
-        parts: the comparisons, each with one problem a range.
-        tuners: labels of those that all comparisons have.
+        parts: comparisons, each with one problem per range.
+        tuners: labels of the tuners that all comparisons have.
     """
 
     parts: Sequence[Part]
@@ -130,25 +137,25 @@ class Together:
 
     @cached_property
     def ranked(self) -> pd.DataFrame:
-        """Ranks among the common tuners: a row a problem, a column a tuner, 1 is best."""
+        """Ranks among the common tuners: one row per problem, one column per tuner, 1 is best."""
         each = pd.concat(
             [ranks(part.statistics.curves, part.statistics.floor) for part in self.parts]
         )
-        # Ranks among all tuners have gaps where some are left out.
+        # Ranks among all tuners have gaps if some tuners are left out.
         return each[list(self.tuners)].rank(axis=1)
 
     @property
     def comparable(self) -> bool:
-        """Whether there are problems and tuners enough for Friedman's and Nemenyi's tests."""
+        """Whether there are enough problems and tuners for Friedman's and Nemenyi's tests."""
         return len(self.ranked) >= PROBLEMS and len(self.tuners) >= _TUNERS
 
     @cached_property
     def tests(self) -> tuple[float, pd.DataFrame]:
-        """Friedman's p-value, and Nemenyi's of each pair of tuners; only where `comparable`."""
+        """Friedman's p-value, and Nemenyi's for each pair of tuners; requires `comparable`."""
         return nemenyi(self.ranked)
 
     def frames(self) -> dict[str, pd.DataFrame]:
-        """The tables ert, pairs, ranks, and nemenyi where `comparable`, by name."""
+        """Build the tables ert, pairs, ranks, and nemenyi if `comparable`, by name."""
         ert, paired = [], []
         for part in self.parts:
             curves, levels = part.statistics.curves, part.statistics.levels
@@ -171,7 +178,14 @@ class Together:
         folders: Sequence[Path],
         out: Path,
     ) -> Several:
-        """What the page in `out` is made from."""
+        """Build the data of the page.
+
+        Args:
+            frames: tables by name.
+            pictures: rendered figures by name.
+            folders: result folders of the comparisons.
+            out: folder of the page.
+        """
         friedman, p_values = self.tests if self.comparable else (float("nan"), None)
         parts = [(part.experiment, part.statistics) for part in self.parts]
         return Several(
@@ -189,15 +203,15 @@ class Together:
 
     @property
     def trusted(self) -> bool:
-        """Whether tuners were trusted in any of them."""
+        """Whether tuners ran without isolation in any of the comparisons."""
         return any(part.experiment.trusted for part in self.parts)
 
     def _squared(self, frame: pd.DataFrame) -> pd.DataFrame:
-        """A table with a column a tuner; it has another only where there is something to say."""
+        """Add the column `trusted` to a table if any tuner ran without isolation."""
         return frame.assign(trusted=True) if self.trusted else frame
 
     def figures(self) -> dict[str, Figure]:
-        """runtime-distribution, and critical-difference where `comparable`."""
+        """Draw the figures runtime-distribution, and critical-difference if `comparable`."""
         drawn = {"runtime-distribution": self._joint_figure()}
         if self.comparable:
             friedman, p_values = self.tests
@@ -211,7 +225,7 @@ class Together:
         return runtimes.joint_runtime_figure(experiment, style, self._shares())
 
     def _shares(self) -> dict[str, Array]:
-        """By tuner: the share reached after 0..100 hundredths of the budget, mean of problems."""
+        """Compute each tuner's share reached after 0..100 % of the budget, mean over problems."""
         each = [
             problem
             for part in self.parts
@@ -221,7 +235,7 @@ class Together:
 
 
 def _shares(curves: Curves, spread: Array) -> list[dict[str, Array]]:
-    """Of each range: by tuner, the share reached after 0..100 hundredths of the budget."""
+    """Compute for each range and tuner the share reached after 0..100 % of the budget."""
     budget = curves.values.shape[1] - 1
     points = np.floor(np.linspace(0, budget, 101)).astype(np.int64)
     shares = []

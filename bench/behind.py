@@ -1,4 +1,4 @@
-"""A comparison's errors against simulations, with reference results in grey behind them."""
+"""Redraw a comparison's error curves with reference results in grey behind them."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ def draw(
     say: Callable[[str], None],
     before: str = "",
 ) -> list[dict[str, Any]]:
-    """Draw a comparison's figures again with references behind them, as files of their own.
+    """Draw a comparison's figures again with references behind them, as separate files.
 
     Args:
-        folder: the comparison's.
-        references: what is drawn behind.
-        out: in whose folder ``figures`` they are written.
-        say: told how the references differ, and what was written.
-        before: begins the files' names.
+        folder: folder of the comparison.
+        references: reference results to draw.
+        out: folder in whose subfolder ``figures`` the files are written.
+        say: callback that prints one line; it gets differences of the references, and files.
+        before: prefix of the file names.
 
     Returns:
-        For programs: each reference, how it differs, and the files.
+        JSON document of each reference, with its differences and the files.
 
     Raises:
-        InputError: a reference is of another problem, or there are too many.
+        InputError: a reference belongs to another problem, or there are too many.
     """
     stored = read(folder, NEEDED)
     if stored.runs.empty:

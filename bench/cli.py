@@ -1,8 +1,8 @@
-"""The command line of simgap; `simgap --help` lists its commands.
+"""Entry point of the command line; `simgap --help` lists the commands.
 
-Heavy packages are imported by the commands that need them, so that `simgap --help` is quick. A
-fault of the user's is one line on stderr and exit code 2; an internal error keeps its traceback.
-With ``--json`` both are a document too (`bench.commands.answer`).
+Heavy packages are imported by the commands that need them, so that `simgap --help` is fast. A user
+error is one line on stderr and exit code 2; an internal error keeps its traceback. With ``--json``
+both are also a JSON document (`bench.commands.answer`).
 """
 
 from __future__ import annotations
@@ -80,35 +80,38 @@ COMMANDS = (
     ("info", add_info, "versions, engines, platform and paths, for a report of a fault"),
     ("completion", add_completion, "print a script by which a shell completes simgap's commands"),
 )
-"""Name, what adds its options, and its line of help, in the order of `simgap --help`."""
+"""Name, function that adds the options, and help line of each command, in help order."""
 
 GARBAGE_THRESHOLD = 50_000
 """Number of new objects after which garbage is collected; Python's default is 700 or 2,000."""
 
 
 class _UsageError(Exception):
-    """A command line that no command understands."""
+    """The command line is not valid."""
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose faults are one line, as every other of the user's is."""
+    """Parser that reports errors in one line, like all other user errors."""
 
     def error(self, message: str) -> NoReturn:
-        from sims.base import InputError  # its message can be printed, whatever was typed
+        from sims.base import InputError  # its message is printable, whatever the user typed
 
         raise _UsageError(f"{InputError(message)}; see {self.prog} --help")
 
-    # argparse declares this method with overloads, of which none takes None for both arguments.
+    # argparse declares this method with overloads; none of them takes None for both arguments.
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse a command line in which a positional argument may follow an option of several
-        values.
+        """Parse a command line where positional arguments may follow an option with several values.
+
+        Args:
+            args: words of the command line; None for those of the process.
+            namespace: object that gets the values.
         """
         words = sys.argv[1:] if args is None else list(args)
         return super().parse_known_args(positionals_first(self, words), namespace)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line, and return the exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     printer: Printer = Json() if "--json" in words else Words()
     try:
@@ -116,15 +119,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except _UsageError as error:
         printer.fault("usage", str(error), FAULT)
         sys.exit(FAULT)
-    # After the parser, which has ended the quick `--help`.
+    # These imports come after the parser, so that `--help` is fast.
     from bench.figures.formats import mark_as_command, pdf_figures
     from sims.base import InputError
 
     if arguments is None:
-        # Only in a process of its own: a caller's environment is not changed.
+        # Only in simgap's own process: the environment of a calling program is not changed.
         _name_glfw_library()
         mark_as_command()
-        # Most of what a command makes while it loads modules stays.
+        # Most objects that a command creates while it loads modules live until its end.
         gc.set_threshold(GARBAGE_THRESHOLD)
     try:
         with printer.working(), pdf_figures(getattr(options, "pdf", False)):
@@ -133,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         printer.fault("input", str(error), FAULT)
         return FAULT
-    except MemoryError as error:  # whoever insisted
+    except MemoryError as error:  # possible when the user has skipped the check of resources
         printer.fault("memory", f"not enough memory: {error}", FAULT)
         return FAULT
     except BrokenPipeError:  # `simgap list ... | head`
@@ -149,9 +152,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _name_glfw_library() -> None:
-    """Tell glfw, which MuJoCo imports, where its library is: the one that it would choose itself.
+    """Set the path of the library of glfw, which MuJoCo imports, to the one glfw would choose.
 
-    Else glfw starts an interpreter for each library that it finds, to ask for its version. That is
+    Otherwise glfw starts an interpreter for each library that it finds, to get its version. That is
     a third of the time of ``import mujoco``, in each process of a command.
     """
     if not sys.platform.startswith("linux") or "PYGLFW_LIBRARY" in os.environ:
@@ -167,7 +170,7 @@ def _name_glfw_library() -> None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The parser of the command line, all commands in it."""
+    """Build the parser of the command line with all commands."""
     codes = "\n".join(f"  {code:<4} {says}" for code, says in EXITS.items())
     whole = _Parser(
         prog="simgap",
@@ -181,7 +184,7 @@ def parser() -> argparse.ArgumentParser:
     for name, add, says in COMMANDS:
         command = commands.add_parser(name, help=says)
         add(command)
-        # Commands that speak of commands ask it.
+        # Commands that describe commands use the parser.
         command.set_defaults(parser=whole)
         command.add_argument(
             "--json",

@@ -1,4 +1,4 @@
-"""A comparison in its folder: begun or resumed there, made, looked at, and reported."""
+"""Comparison of tuners in its result folder: begin, resume, run, show status, and report."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ Say = Callable[[str], None]
 
 
 class Comparison:
-    """Tuners x targets x seeds, kept in a folder; fulfils `bench.study.Study`.
+    """Comparison of tuners x targets x seeds in a result folder; implements `bench.study.Study`.
 
     Args:
-        folder: of a comparison, to be looked at and reported. `begin` and `resume` give one that
-            can be made too.
+        folder: result folder of a comparison, for status and report. Use `begin` or `resume` for a
+            comparison that can be run.
 
     Attributes:
-        folder: where everything lies.
-        configuration: what it is for.
-        results: the problem, the plan and what is kept; None where it is only looked at.
+        folder: result folder.
+        configuration: configuration of the comparison.
+        results: problem, plan and stored runs; None if the comparison is read-only.
 
     Raises:
-        InputError: it is no such folder, or it is damaged.
+        InputError: the folder is not that of a comparison, or it is damaged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -72,8 +72,14 @@ class Comparison:
         jobs: int = 2,
         salt: str | None = None,
     ) -> Comparison:
-        """A comparison in a new folder; the plan stands, and nothing has been run; see
-        `bench.study.Study.begin`.
+        """Plan a comparison in a new folder, without running it; see `bench.study.Study.begin`.
+
+        Args:
+            experiment: configuration of the comparison.
+            plugins: plugin files.
+            folder: result folder; None for a default name.
+            jobs: number of worker processes.
+            salt: salt of the targets; None for the default.
         """
         from bench.runs.begun import begun
         from bench.runs.identity import fingerprint
@@ -81,7 +87,7 @@ class Comparison:
 
         new = begun(experiment, folder, jobs, salt)
         results = prepare(new.experiment, new.secret)
-        # Before there is a folder: a fault of the user's leaves nothing behind.
+        # This comes before the folder is created, so that a user error leaves no files behind.
         if jobs:
             refuse_unreachable(new.experiment)
         hashes = fingerprint(new.experiment, plugins)
@@ -92,8 +98,11 @@ class Comparison:
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Comparison:
-        """A comparison that was interrupted: what is finished is kept, what is missing remains; see
-        `bench.study.Study.resume`.
+        """Open an interrupted comparison with its finished runs; see `bench.study.Study.resume`.
+
+        Args:
+            folder: result folder.
+            plugins: additional plugin files.
         """
         from bench.runs.identity import unchanged
         from bench.runs.runner import prepare
@@ -106,11 +115,11 @@ class Comparison:
         return comparison
 
     def _attach(self, results: Results) -> None:
-        """Open the journal of the folder, write or check the plan."""
+        """Open the journal of the folder, and write or check the plan."""
         from bench.runs.training import folder as trained
 
         self.results = results
-        # What is known of truths, of rivals and of earlier trainings is out of a tuner's reach.
+        # Tuners must not access true parameters, results of other tuners, or earlier trainings.
         results.hidden = tuple(str(place.resolve()) for place in (self.folder, trained()))
         ids = [job.order.run for job in results.plan]
         if not (self.folder / FOLDER).exists():
@@ -128,16 +137,16 @@ class Comparison:
         except InputError:
             journal.close()
             raise
-        # Killed between the folder and its plan: there are no runs that could contradict it.
+        # The process was killed before it wrote the plan, so there are no runs to compare with it.
         if planned is None:
             write_plan(self.folder, ids)
         results.kept = journal
 
     def _check_kept(self, journal: Journal, ids: list[str]) -> None:
-        """Check every row that is kept: what is damaged would spoil the results.
+        """Check every stored row, because damaged rows would falsify the results.
 
         Raises:
-            InputError: something is damaged, or of another plan.
+            InputError: a row is damaged, or belongs to another plan.
         """
         experiment = self.configuration.experiment
         for path, held, records in journal.files():
@@ -148,10 +157,10 @@ class Comparison:
             check_alike(runs, file, statuses, partial(_at_file, file), "its statuses")
 
     def _complete(self, ids: list[str]) -> dict[int, Status]:
-        """The statuses of a folder that says it is finished.
+        """Return the statuses of a finished comparison by their index in the plan.
 
         Raises:
-            InputError: it holds other runs than those planned, or is damaged.
+            InputError: the folder has other runs than the plan, or is damaged.
         """
         statuses = self._stored()
         if [status.run for status in statuses] != ids:
@@ -162,7 +171,7 @@ class Comparison:
         return dict(enumerate(statuses))
 
     def _stored(self) -> list[Status]:
-        """How the runs of a finished comparison ended, in the order of its plan."""
+        """Return the statuses of a finished comparison in the order of its plan."""
         statuses = read(self.folder, ["run", "tuner", "k"]).statuses
         made = statuses[statuses["status"] != "skipped"]
         rows: list[dict[str, Any]] = [
@@ -174,11 +183,15 @@ class Comparison:
     def make(
         self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
     ) -> Made:
-        """Make what is missing and write the results; see
-        `bench.study.Study.make`.
+        """Run what is missing, and write the results; see `bench.study.Study.make`.
+
+        Args:
+            jobs: number of worker processes; 0 for none.
+            progress: called for every step.
+            pool: pool to use instead of local workers.
         """
-        # All that the results need is imported before the work: an interrupt in the midst of a
-        # first import leaves half a module behind, and writing what there is would die of it.
+        # Modules that the results need are imported before the work. An interrupt during a first
+        # import would leave a module half imported, and the results could not be written.
         import pandas as pd  # noqa: F401
         from pyarrow import compute, parquet  # noqa: F401
 
@@ -186,12 +199,12 @@ class Comparison:
 
         results = self._begun()
         journal = results.kept
-        if not isinstance(journal, Journal):  # complete before we came
+        if not isinstance(journal, Journal):  # the comparison was complete before
             return Made(len(results.plan), len(results.plan))
         try:
             run(results, self.plugins, jobs, progress or silent, pool)
         finally:
-            # Also where a worker cannot be had: what there is can be looked at.
+            # If workers cannot be started, the results so far are still written.
             write_results(
                 self.folder,
                 journal,
@@ -212,7 +225,7 @@ class Comparison:
         return made
 
     def close(self) -> None:
-        """Let go of the folder without making what is missing."""
+        """Release the folder without running what is missing."""
         if self.results is not None and isinstance(self.results.kept, Journal):
             self.results.kept.close()
 
@@ -222,7 +235,7 @@ class Comparison:
         return self.results
 
     def _write_spectra(self, results: Results) -> None:
-        """Write identifiability.csv, a row a target and direction, of several parameters."""
+        """Write identifiability.csv, one row per target and direction, for several parameters."""
         if results.spectra:
             from bench.analysis.spectra import spectra_table
 
@@ -231,10 +244,10 @@ class Comparison:
             write(self.folder / "identifiability.csv", table.to_csv(index=False))
 
     def status(self) -> Standing:
-        """What the folder holds and what is missing; another process may be at work there.
+        """Return what the folder contains and what is missing; another process may be running it.
 
         Raises:
-            InputError: it is damaged.
+            InputError: the folder is damaged.
         """
         held = self.configuration
         ends = tuple(self._ends())
@@ -257,17 +270,20 @@ class Comparison:
 
     @property
     def _under_way(self) -> bool:
-        """Whether something remains to be made or written: segments go when all is."""
+        """Whether the comparison is unfinished: its journal is deleted when all is written."""
         return (self.folder / FOLDER).exists()
 
     def finish(self, say: Say) -> int:
-        """Write tables and figures of what there is, and say what came out.
+        """Write tables and figures of the stored runs, and print the results.
+
+        Args:
+            say: callback that prints one line.
 
         Returns:
-            How many runs failed.
+            Number of failed runs.
 
         Raises:
-            InputError: nothing has been written yet, or it is damaged.
+            InputError: nothing has been written yet, or the results are damaged.
         """
         from bench.problem.problem import Problem
         from bench.report import finish
@@ -281,12 +297,12 @@ class Comparison:
 
 
 def _at_file(file: RunsFile, _row: int, says: str) -> InputError:
-    """The error for a status of a segment, which stands in none of its rows."""
+    """Make the error for a status of a journal file, which belongs to none of its rows."""
     return file.fault(None, says)
 
 
 def _end(name: str, status: Status | None) -> End:
-    """How a planned run ended, or that it is missing; its id begins with its tuner's label."""
+    """Return how a planned run ended, or that it is missing; its id begins with the tuner label."""
     tuner = name.partition("/")[0]
     if status is None:
         return End(name, tuner, MISSING)

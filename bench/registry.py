@@ -1,8 +1,8 @@
-"""Finds tuners, simulators, effects and diagnosers: the project's own, installed plugins' and those
-of `--plugin FILE`.
+"""Registries of tuners, simulators, effects and diagnosers, and loading of plugins.
 
-All come in the same way (`sims.registry.Registry`), through the entry-point groups `simgap.tuners`,
-`simgap.simulators`, `simgap.effects` and `simgap.diagnosers`.
+Parts of the project, of installed plugins and of `--plugin FILE` are registered in the same way
+(`sims.registry.Registry`), through the entry-point groups `simgap.tuners`, `simgap.simulators`,
+`simgap.effects` and `simgap.diagnosers`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ diagnosers: Registry[Diagnoser] = Registry(
 )
 
 REGISTRIES: tuple[Registry[Any], ...] = (tuners, simulators, effects, diagnosers)
-"""Of each kind of part, in the order in which a plugin's class is tried."""
+"""Registries of all kinds of parts, in the order in which a plugin's class is tried."""
 
 
 def robot(
@@ -56,18 +56,18 @@ def robot(
     engine: Mapping[str, Any] | None = None,
     free: Sequence[str] = (),
 ) -> type[Simulator]:
-    """The simulator of a robot's model file.
+    """Make the simulator of a robot's model file.
 
     Args:
-        path: MJCF or URDF.
-        actuators: that the file lacks, as a recording states them.
-        engine: time step and integrator other than the file's.
-        free: numbers of the file to tune, as ``damping@*``.
+        path: MJCF or URDF file.
+        actuators: actuators that the file lacks, as in a recording's description.
+        engine: time step and integrator if they differ from the file's.
+        free: numbers of the file to tune, such as ``damping@*``.
 
     Raises:
-        InputError: the file cannot be used, or something asked for does not exist in it.
+        InputError: the file cannot be used, or something requested does not exist in it.
     """
-    # Loaded here alone: most commands have nothing to do with robots.
+    # These modules are imported here, because most commands do not use robots.
     from sims.robot.reading import read
     from sims.robot.simulator import robot_simulator
 
@@ -75,13 +75,13 @@ def robot(
 
 
 def load_plugins(paths: str | Path | Iterable[str | Path]) -> None:
-    """Register every tuner, simulator, effect and diagnoser that is defined in the files, once.
+    """Register every tuner, simulator, effect and diagnoser that the files define, once.
 
-    A file ending in .toml is an extended simulator as `simgap explain` writes it, loaded after what
-    it may extend.
+    A file ending in .toml is an extended simulator as written by `simgap explain`. It is loaded
+    after the files that it may extend.
 
     Raises:
-        InputError: a file is missing, does not run, or defines none of them; of this file nothing
+        InputError: a file is missing, does not run, or defines no such part; nothing of this file
             is registered then.
     """
     given = [paths] if isinstance(paths, str | Path) or not isinstance(paths, Iterable) else paths
@@ -97,7 +97,8 @@ def load_plugins(paths: str | Path | Iterable[str | Path]) -> None:
         try:
             _load(path)
         except InputError:
-            # Half a plugin would count as loaded, and its error would be said only once.
+            # A partly registered plugin would count as loaded, and its error would not be reported
+            # again.
             for registry, snapshot in zip(REGISTRIES, before, strict=True):
                 registry.restore(snapshot)
             raise
@@ -117,11 +118,11 @@ def _load(path: Path) -> None:
 
 
 def _parts(module: ModuleType) -> list[tuple[Registry[Any], type]]:
-    """The module's own complete classes of any kind, each with its registry."""
+    """Return the non-abstract classes that the module defines, each with its registry."""
     own = [
         value
         for value in vars(module).values()
-        # what it imports belongs to others
+        # Imported classes belong to other modules.
         if inspect.isclass(value) and value.__module__ == module.__name__
     ]
     return [
@@ -134,11 +135,11 @@ def _parts(module: ModuleType) -> list[tuple[Registry[Any], type]]:
 
 
 def _module_name(path: Path) -> str:
-    """How the module of a plugin file is called."""
+    """Return the module name of a plugin file."""
     name = f"simgap_plugin_{path.stem}"
     number = 1
-    # Two files of one name in two folders are two modules: a class is traced to its source by its
-    # module, and must not be taken for one of the other file.
+    # Two files of the same name in different folders need different modules, because the source of
+    # a class is found by its module.
     while getattr(sys.modules.get(name), "__file__", str(path)) != str(path):
         number += 1
         name = f"simgap_plugin_{path.stem}_{number}"
@@ -152,7 +153,7 @@ def _run(path: Path) -> ModuleType:
     if spec is None or spec.loader is None:
         raise InputError(f"plugin {path}: expected a Python file ending in .py")
     module = importlib.util.module_from_spec(spec)
-    # Dataclasses look their module up while they are made.
+    # Dataclasses look up their module when they are made.
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
@@ -160,14 +161,14 @@ def _run(path: Path) -> ModuleType:
         raise InputError(f"plugin {path}, line {error.lineno}: {error.msg}") from error
     except KeyboardInterrupt:
         raise
-    # Also what asks to exit, or is no `Exception` at all.
+    # This includes SystemExit and other exceptions that are not an `Exception`.
     except BaseException as error:
         raise InputError(f"plugin {path}: {type(error).__name__}: {_said(error)}") from error
     return module
 
 
 def _said(error: BaseException) -> str:
-    """What an error says, where it says anything: its words are a plugin's code too."""
+    """Return the message of an error; it is made by a plugin's code, which may fail again."""
     try:
         return str(error)
     except Exception:

@@ -1,4 +1,4 @@
-"""What a finished comparison shows: its tables, its figures, and a short table on the terminal."""
+"""Write the tables, figures and report page of a comparison, and print a summary."""
 
 from __future__ import annotations
 
@@ -51,21 +51,25 @@ NEEDED = (
 )
 """Columns of the runs that tables and figures use."""
 REPORT = "report.html"
-"""The page of a comparison, in its folder."""
+"""File name of the report page in the folder of a comparison."""
 WINNER_COLUMNS = ["experiment", "range", "threshold", "from_seconds", "to_seconds", "tuner"]
 _WIDTH = 120
-"""Characters of a line on the terminal."""
+"""Width of a line on the terminal in characters."""
 _SHOWN = (3, 10)
-"""Numbers of simulations of which errors along directions are said, beside the whole budget."""
+"""Numbers of simulations for printed errors along directions, in addition to the budget."""
 
 
 @numeric_warnings_silenced()
 def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
-    """Write tables and figures of the comparison in `folder` from what is stored there, and say
-    what came out.
+    """Write tables, figures and the report page of a comparison, and print a summary.
+
+    Args:
+        folder: result folder of the comparison.
+        problem: tuning problem of the comparison.
+        say: callback that prints one line.
 
     Returns:
-        How many runs failed.
+        Number of failed runs.
 
     Raises:
         InputError: the folder is not that of a comparison, or cannot be written to.
@@ -111,17 +115,19 @@ def finish(folder: Path, problem: Problem, say: Callable[[str], None]) -> int:
     for figure in figures:
         say(f"figure  {figure}")
     say(f"report  {folder / REPORT}")
-    # A tuner that cannot be used here is no failure of the comparison.
+    # A tuner that cannot be used here does not count as a failure of the comparison.
     return int((failed["status"] != "skipped").sum())
 
 
 def tables(stored: Stored, statistics: Statistics | None = None) -> dict[str, pd.DataFrame]:
-    """Return the tables of a comparison by name: table, ert, ranking, pairs, break_even, who_wins;
-    none without a run.
+    """Build the tables of a comparison: table, ert, ranking, pairs, break_even and who_wins.
 
     Args:
-        stored: the comparison as `bench.store.folder.read` gives it.
-        statistics: of `statistics_of(stored)`, for who has it.
+        stored: stored comparison, from `bench.store.folder.read`.
+        statistics: statistics of the comparison; None to compute them.
+
+    Returns:
+        Tables by name; empty without a run.
     """
     if stored.runs.empty:
         return {}
@@ -147,7 +153,7 @@ def _break_even(experiment: str, statistics: Statistics) -> pd.DataFrame:
         for level, ranges in statistics.prices.items()
         for kind, by_tuner in ranges.items()
     ]
-    # An empty part would make columns of numbers into columns of objects.
+    # Concatenation with an empty part would change numeric columns to object columns.
     parts = [part for part in parts if len(part)]
     return pd.concat(parts) if parts else pd.DataFrame(columns=EVEN_COLUMNS)
 
@@ -163,7 +169,7 @@ def _who_wins(experiment: str, statistics: Statistics) -> pd.DataFrame:
 
 
 def _drawn(stored: Stored, labels: Labels, statistics: Statistics) -> dict[str, Pictures]:
-    """Every figure that there is, by name."""
+    """Render all figures that exist for the comparison, by name."""
     return {
         name: taken(comparison.figure(stored, labels, name, statistics))
         for name in comparison.names(stored)
@@ -171,7 +177,7 @@ def _drawn(stored: Stored, labels: Labels, statistics: Statistics) -> dict[str, 
 
 
 def _kept(folder: Path, pictures: Mapping[str, Pictures]) -> list[Path]:
-    """Write the figures; the PNG files."""
+    """Write the figures, and return the paths of the PNG files."""
     return [
         keep(folder / "figures" / comparison.FILES[name], picture.png, picture.pdf)[0]
         for name, picture in pictures.items()
@@ -179,13 +185,13 @@ def _kept(folder: Path, pictures: Mapping[str, Pictures]) -> list[Path]:
 
 
 def _missing(folder: Path, stored: Stored) -> int:
-    """Runs that are planned and not made yet."""
+    """Return the number of planned runs that are missing."""
     plan = read_plan(folder) if (folder / FOLDER).exists() else None
     return max(len(plan) - int(stored.runs["run"].nunique()), 0) if plan else 0
 
 
 def _marks(experiment: Experiment) -> list[str]:
-    """How the runs were made, where it takes something away from what came out."""
+    """Return notes on how the runs were made that limit the value of the results."""
     texts = []
     if experiment.trusted:
         texts.append(f"\n{TRUSTED}")
@@ -195,7 +201,7 @@ def _marks(experiment: Experiment) -> list[str]:
 
 
 def _headlines(results: Results) -> list[str]:
-    """Who is best after 1, 3, 10 and all simulations, a paragraph for each range."""
+    """Describe the best tuners after 1, 3, 10 and all simulations, one paragraph per range."""
     statistics, texts = results.statistics, []
     label = results.label(results.shown_metric)
     for kind in results.ranges:
@@ -210,7 +216,7 @@ def _headlines(results: Results) -> list[str]:
 
 
 def _standing(one: headline.Standing) -> list[str]:
-    """Lines of one number of simulations; what has no tuners is left out."""
+    """Format the lines of one number of simulations; verdicts without tuners are left out."""
     best = f"{', '.join(one.best)} ({one.error})" if one.best else "none: every run failed"
     parts = {
         "best": best,
@@ -230,7 +236,7 @@ def _standing(one: headline.Standing) -> list[str]:
 
 
 def _results(lines: pd.DataFrame, labels: Labels, statistics: Statistics) -> list[str]:
-    """The numbers, a short table or two for each range."""
+    """Format one or two short tables for each range."""
     texts = []
     for kind in lines["range"][lines["range"] != ""].unique():
         texts.append("\n" + _text(lines, kind, labels, statistics))
@@ -240,7 +246,7 @@ def _results(lines: pd.DataFrame, labels: Labels, statistics: Statistics) -> lis
 
 
 def _text(lines: pd.DataFrame, kind: str, labels: Labels, statistics: Statistics) -> str:
-    """One range as a table for the terminal."""
+    """Format the median errors of one range as a table for the terminal."""
     present = set(lines["metric"])
     if kind == "real":
         held_out = "heldout_error" in present
@@ -258,14 +264,15 @@ def _text(lines: pd.DataFrame, kind: str, labels: Labels, statistics: Statistics
 
 
 def _laid_out(frame: pd.DataFrame) -> str:
-    """Numbers with two digits, and no names above rows and columns."""
+    """Format numbers with two digits, without names of rows and columns."""
     bare = frame.rename_axis(index=None, columns=None)
     return bare.to_string(float_format=lambda value: f"{value:.2g}")
 
 
 def _directions(lines: pd.DataFrame, kind: str, channel: str, statistics: Statistics) -> str:
-    """Errors along stiff and sloppy directions, and of prediction, of one range; empty where there
-    are none.
+    """Format errors along stiff and sloppy directions, and held-out errors, of one range.
+
+    The text is empty if there are none.
     """
     titles = {"stiff_error": "stiff", "sloppy_error": "sloppy", "heldout_error": "unseen"}
     part = lines[(lines["range"] == kind) & lines["metric"].isin(titles)]
@@ -286,7 +293,7 @@ def _directions(lines: pd.DataFrame, kind: str, channel: str, statistics: Statis
 
 
 def _seconds(lines: pd.DataFrame, statistics: Statistics) -> str:
-    """What a tuner took beside what its simulations took, and its training."""
+    """Format the mean seconds per run of each tuner, of its simulations, and of its training."""
     last = lines[lines["runs"] > 0].sort_values("simulations").groupby("tuner", sort=False).last()
     columns = {
         "tuner": "tuner_seconds",
@@ -299,8 +306,9 @@ def _seconds(lines: pd.DataFrame, statistics: Statistics) -> str:
 
 
 def failure_lines(failed: pd.DataFrame) -> list[str]:
-    """A table of failures: a line for each tuner and kind, with the first reason's error and where
-    it was raised.
+    """Format failures as lines, one for each tuner and status.
+
+    Each line has the error of the first reason, and where it was raised.
     """
     lines = [
         (str(tuner), str(len(group)), str(status), first_line(str(group["reason"].iloc[0])))
@@ -324,13 +332,13 @@ _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+), in (?P<functio
 
 
 def first_line(reason: str) -> str:
-    """What went wrong and where, of a reason that may be a traceback."""
+    """Return error and location from a reason, which may be a traceback."""
     lines = without_isolation(reason.strip()).splitlines() or [""]
     frames = [i for i, line in enumerate(lines) if _FRAME.search(line)]
     if not frames:
         return lines[-1].strip()
-    # The error's own words begin behind the last frame, at the margin; what follows them may be
-    # pages.
+    # The error message is the first line without indentation after the last frame; it may be
+    # followed by pages of text.
     words = next((line for line in lines[frames[-1] + 1 :] if line[:1].strip()), lines[-1])
     file, number, function = _FRAME.findall(lines[frames[-1]])[0]
     return f"{words} ({Path(file).name}, line {number}, in {function})"

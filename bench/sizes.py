@@ -1,7 +1,7 @@
-"""What work would need, estimated before it begins, against what the machine has.
+"""Estimate the resources that work needs, and compare them with those of the machine.
 
-Estimates are low on purpose: only what is hopeless is refused, never what is merely long. Whoever
-knows better insists (``--force``, ``force=True``).
+Estimates are low on purpose: only work that is not feasible is refused, not work that takes long.
+The user can skip the check (``--force``, ``force=True``).
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from sims.base import InputError, Simulator
 from sims.simulated import Simulated
 
 INSIST = "or insist with --force (force=True in Python)"
-"""How a message ends that a person may overrule."""
+"""End of messages about checks that the user can skip."""
 MOST_STEPS = 1e9
-"""Steps of one simulation: the fastest engine takes hours for them."""
+"""Maximum number of steps of one simulation; the fastest engine takes hours for them."""
 MOST_SECONDS = 30 * 86400.0
-"""Seconds of work."""
+"""Maximum duration of work in seconds."""
 STEP = 1e-7
-"""Seconds that a step takes at the least."""
+"""Minimum duration of a time step in seconds."""
 SIMULATION = 1e-6
-"""Seconds that a simulation takes at the least."""
+"""Minimum duration of a simulation in seconds."""
 STEP_BYTES = 32
-"""Bytes of memory for a step of a simulation under way: its length, its end, and what is felt."""
+"""Memory of a step of a running simulation in bytes: its length, its end, and applied inputs."""
 NUMBER = 8
-"""Bytes of a number."""
+"""Size of a number in bytes."""
 _CONTROL = Path("/sys/fs/cgroup/memory.max")
-"""Where Linux says how much memory a container may use."""
+"""File in which Linux states the memory limit of a container."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What there is; infinite where the system does not say.
+    """Resources of a machine; infinite if the system does not state them.
 
     Attributes:
-        memory: bytes.
-        disk: free bytes.
-        files: free files.
+        memory: memory in bytes.
+        disk: free disk space in bytes.
+        files: number of files that can be created.
     """
 
     memory: float = math.inf
@@ -51,16 +51,16 @@ class Machine:
 
 @dataclass(frozen=True)
 class Need:
-    """What work would need at the least.
+    """Minimum resources that work needs.
 
     Attributes:
-        made: what it is made of, e.g. ``2 runs x budget 100``.
+        made: what the work consists of, for example ``2 runs x budget 100``.
         change: what to change to need less.
-        memory: bytes at once.
-        disk: bytes to be written.
-        files: to be written.
-        steps: of an engine in one simulation.
-        seconds: until it is done.
+        memory: memory in bytes.
+        disk: disk space in bytes.
+        files: number of files.
+        steps: number of time steps in one simulation.
+        seconds: duration in seconds.
     """
 
     made: str
@@ -72,7 +72,7 @@ class Need:
     seconds: float = 0.0
 
     def beyond(self, machine: Machine) -> str:
-        """What is needed and not there, with what there is; empty where there is enough."""
+        """Describe the first need that exceeds the machine; empty if none does."""
         for wanted, there, unit in (
             (self.memory, machine.memory, "of memory"),
             (self.disk, machine.disk, "of free disk"),
@@ -89,26 +89,26 @@ class Need:
 
 
 def refuse(who: str, need: Need, machine: Machine, force: bool = False) -> None:
-    """Refuse work that is hopeless on this machine.
+    """Raise an error for work that is not feasible on this machine.
 
     Args:
-        who: what a message begins with.
-        need: what it would need.
-        machine: what there is.
-        force: whether the user insists.
+        who: beginning of the message.
+        need: resources that the work needs.
+        machine: resources of the machine.
+        force: True to skip the check.
 
     Raises:
-        InputError: more is needed than there is, in one line.
+        InputError: the work needs more than is available.
     """
     if not force and (what := need.beyond(machine)):
         raise InputError(f"{who}: {need.made} would need {what}; {need.change}, {INSIST}")
 
 
 def machine(folder: Path | None = None) -> Machine:
-    """What this machine has.
+    """Return the resources of this machine.
 
     Args:
-        folder: where would be written; the current one where None. It need not exist yet.
+        folder: folder to write to, which need not exist; None for the current one.
     """
     place = (folder or Path()).absolute()
     while not place.is_dir() and place != place.parent:
@@ -121,16 +121,16 @@ def machine(folder: Path | None = None) -> Machine:
 
 
 def largest_step(simulator: Simulator) -> float:
-    """Seconds of a simulator's longest step; one that does not say has one a sample."""
+    """Return a simulator's largest time step in seconds; infinite if it does not state one."""
     return simulator.engine.largest_step if isinstance(simulator, Simulated) else math.inf
 
 
 def _memory() -> float:
-    """Bytes of memory: the machine's, or what a container may use of it."""
+    """Return the memory in bytes: the machine's, or the limit of a container."""
     limits = [math.inf]
-    with suppress(AttributeError, OSError, ValueError):  # a system that does not say
+    with suppress(AttributeError, OSError, ValueError):  # a system that does not state it
         limits.append(float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE"))
-    with suppress(OSError, ValueError):  # no container, or one without a limit: "max"
+    with suppress(OSError, ValueError):  # no container, or the limit "max"
         limits.append(float(_CONTROL.read_text()))
     return min(limit for limit in limits if limit > 0)
 
@@ -140,12 +140,12 @@ def _files(place: Path) -> float:
         free = os.statvfs(place).f_favail
     except (AttributeError, OSError):
         return math.inf
-    # File systems that make room as they go say 0.
+    # File systems that create inodes on demand report 0.
     return float(free) or math.inf
 
 
 def size(count: float) -> str:
-    """Bytes as a person reads them."""
+    """Format a number of bytes with a unit."""
     for unit in ("B", "kB", "MB", "GB", "TB", "PB"):
         if count < 1000:
             return f"{count:.3g} {unit}"

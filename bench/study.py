@@ -1,7 +1,7 @@
-"""Studies: what an experiment asks for, made in a folder.
+"""Studies in result folders: the interface, and the choice of the kind of study.
 
-Comparisons of tuners and of diagnosers, bounce shots and studies of a missing effect are kinds of
-one contract, and this is the one place that tells which is which.
+Comparisons of tuners, comparisons of diagnosers, bounce shots and studies of a missing effect
+implement the same interface. Only this module decides which of them an experiment describes.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 
 class Study(Protocol):
-    """A study in its folder.
+    """A study in its result folder.
 
-    ``Kind(folder)`` opens one to look at it and to report it, without hindering whoever is at work
-    there; `begin` and `resume` give one that can be made.
+    ``Kind(folder)`` opens a study for status and report, without disturbing a process that runs it.
+    `begin` and `resume` give a study that can be run.
 
     Attributes:
-        folder: where everything lies.
-        configuration: what it is for.
+        folder: result folder.
+        configuration: configuration of the study.
     """
 
     folder: Path
@@ -48,56 +48,61 @@ class Study(Protocol):
         jobs: int = 2,
         salt: str | None = None,
     ) -> Study:
-        """A study in a new folder, checked and planned.
+        """Check and plan a study in a new folder.
 
         Args:
-            experiment: what it is of.
+            experiment: configuration of the study.
             plugins: plugin files that it needs; the caller has loaded them.
-            folder: new or empty; one below results/ that is named for the time where None.
-            jobs: worker processes that it is meant to be made with; 0 for none, and tuners that
-                are trusted.
-            salt: what its targets are drawn from, secret until it is complete; a fresh one where
-                None.
+            folder: new or empty folder; None for one below results/ that is named after the time.
+            jobs: number of worker processes; 0 for none, and tuners without isolation.
+            salt: salt of the targets, secret until the study is complete; None for a new one.
 
         Raises:
-            InputError: a fault in the experiment, or the folder is not free.
+            InputError: the experiment has an error, or the folder is not free.
         """
         ...
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> Study:
-        """A study that was interrupted; its own plugins are loaded, and these.
+        """Open an interrupted study to complete it.
+
+        Args:
+            folder: result folder.
+            plugins: additional plugin files; the study's own are loaded in any case.
 
         Raises:
-            InputError: the folder is damaged, or something that matters has changed since.
+            InputError: the folder is damaged, or something relevant has changed since.
         """
         ...
 
     def make(
         self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
     ) -> Made:
-        """Make what is missing; says how far it came, also where it was interrupted.
+        """Run what is missing.
 
         Args:
-            jobs: worker processes; 0 for none, and everything in this one.
-            progress: told of every step.
-            pool: where to run instead, e.g. on a cluster.
+            jobs: number of worker processes; 0 to run everything in this process.
+            progress: called for every step.
+            pool: pool to use instead, for example of a cluster.
+
+        Returns:
+            How far the study came, also if it was interrupted.
 
         Raises:
-            InputError: workers cannot be had; what was finished is kept.
+            InputError: workers cannot be started; finished runs are stored.
         """
         ...
 
     def close(self) -> None:
-        """Let go of the folder without making what is missing."""
+        """Release the folder without running what is missing."""
         ...
 
     def status(self) -> Standing:
-        """What the folder holds, and what is missing."""
+        """Return what the folder contains, and what is missing."""
         ...
 
     def finish(self, say: Say) -> int:
-        """Write tables and figures of what there is, and say what came out; how many failed."""
+        """Write tables and figures, print the results, and return the number of failures."""
         ...
 
 
@@ -108,7 +113,15 @@ def begin(
     jobs: int = 2,
     salt: str | None = None,
 ) -> Study:
-    """Begin the study that an experiment asks for; see `Study.begin`."""
+    """Check and plan the study of an experiment; see `Study.begin`.
+
+    Args:
+        experiment: configuration of the study.
+        plugins: plugin files that it needs.
+        folder: new or empty folder; None for a default name.
+        jobs: number of worker processes.
+        salt: salt of the targets; None for a new one.
+    """
     return kind_of(experiment).begin(experiment, plugins, folder, jobs, salt)
 
 
@@ -119,31 +132,33 @@ def begin_all(
     jobs: int = 2,
     salt: str | None = None,
 ) -> list[Study]:
-    """Begin the study, or the studies where the experiment sweeps over values or names others.
+    """Check and plan one study, or several if the experiment sweeps or names other experiments.
 
     Args:
-        experiment: what is asked for.
+        experiment: configuration of the study or studies.
         plugins: as in `Study.begin`.
-        folder: of the study; of several the folder in which each gets its own, named as its
-            experiment is.
+        folder: folder of the study; for several studies the folder that contains one subfolder for
+            each, with the name of its experiment.
         jobs: as in `Study.begin`.
-        salt: as in `Study.begin`; of several one for all, so that they meet the same targets.
+        salt: as in `Study.begin`; several studies of one sweep share it, so that they have the same
+            targets.
 
     Raises:
-        InputError: a fault in one of them, or the folder is not free; nothing is left behind.
+        InputError: one of the studies has an error, or the folder is not free; no files are left
+            behind.
     """
     from bench.problem.experiment import expand
 
     wanted = expand(experiment)
     if len(wanted) == 1:
         return [begin(wanted[0], plugins, folder, jobs, salt)]
-    # Experiments of their own have salts of their own: one that is complete gives away no other's.
+    # Separate experiments have separate salts, so that a complete one does not reveal another's.
     if salt is None and not experiment.salt and not experiment.experiments:
         salt = fresh()
     parent = free_folder(experiment, folder)
     begun: list[Study] = []
     try:
-        # All before the first is made: a fault in the last would show after hours.
+        # All are planned before the first is run, so that an error in the last one shows at once.
         for one in wanted:
             begun.append(begin(one, plugins, parent / one.name, jobs, salt))
     except BaseException:
@@ -157,7 +172,7 @@ def begin_all(
 
 
 def parts_of(folder: Path) -> list[Path]:
-    """The folders of the studies in a folder: itself, or those that a sweep has put there."""
+    """Return the folders of the studies in a folder: itself, or the subfolders of a sweep."""
     if (folder / CONFIGURATION).exists() or not folder.is_dir():
         return [folder]
     inside = sorted(path for path in folder.iterdir() if (path / CONFIGURATION).exists())
@@ -165,12 +180,11 @@ def parts_of(folder: Path) -> list[Path]:
 
 
 def conclude(folder: Path, say: Say) -> None:
-    """Write and say what the studies in a folder come to together, where they are such as that can
-    be said of.
+    """Write and print the joint results of the studies in a folder, if their kind has any.
 
     Args:
-        folder: as `begin_all` was given it.
-        say: prints a line.
+        folder: folder that was given to `begin_all`.
+        say: callback that prints one line.
     """
     parts = parts_of(folder)
     experiments = [configuration(part).experiment for part in parts]
@@ -181,22 +195,27 @@ def conclude(folder: Path, say: Say) -> None:
 
 
 def resume(folder: Path, plugins: Sequence[str] = ()) -> Study:
-    """Take up the study in a folder; see `Study.resume`."""
+    """Open an interrupted study to complete it; see `Study.resume`.
+
+    Args:
+        folder: result folder.
+        plugins: additional plugin files.
+    """
     return _kind_in(folder).resume(folder, plugins)
 
 
 def opened(folder: Path) -> Study:
-    """The study in a folder, to be looked at and reported.
+    """Open the study in a folder, for status and report.
 
     Raises:
-        InputError: there is none, or it is damaged.
+        InputError: there is no study, or it is damaged.
     """
     return _kind_in(folder)(folder)
 
 
 def kind_of(experiment: Experiment) -> type[Study]:
-    """Which study an experiment asks for."""
-    # Imported here: who compares needs none of what makes shots.
+    """Return the kind of study that an experiment describes."""
+    # The classes are imported here, because a comparison does not need the other studies' modules.
     if experiment.shot:
         from bench.shot.study import BounceShotStudy
 

@@ -1,7 +1,8 @@
-"""The tuner's contract: a run is a generator that yields proposals and receives evaluations.
+"""Tuner interface: a run is a generator that yields proposals and receives evaluations.
 
-A tuner works in the unit cube and never sees units, the simulator or the truth. The harness
-(`bench`) owns the loop: it simulates, counts, times and logs; the method reads like its paper.
+A tuner works in the unit cube and has no access to units, the simulator or the true parameters. The
+harness (`bench`) runs the loop: it simulates, counts, measures time and logs. The code of a tuner
+can therefore follow its paper closely.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ Array = NDArray[np.float64]
 
 
 class Evaluation(NamedTuple):
-    """What the simulator showed for the proposals of one `yield`.
+    """Result of simulating the proposals of one `yield`.
 
     Attributes:
-        proposals: what was simulated (n, dim): the proposals, moved into the unit cube where they
-            lay outside it.
-        observations: (n, T, C), SI units.
-        losses: (n,), each `Task.loss` of its observation; not finite where the simulation failed.
+        proposals: (n, dim) simulated points: the proposals, moved to the boundary of the unit cube
+            if they were outside.
+        observations: (n, T, C) observations in SI units.
+        losses: (n,) root mean square of the scaled residuals of each observation; not finite if the
+            simulation failed.
     """
 
     proposals: Array
@@ -34,15 +36,15 @@ class Evaluation(NamedTuple):
 
 
 class Ask(NamedTuple):
-    """Proposals together with what the tuner would deliver now.
+    """Proposals together with what the tuner recommends now.
 
-    Yield a bare array to have the harness recommend the proposal of the lowest loss seen; yield an
-    `Ask` to recommend something else. The recommendation holds until the next `yield`.
+    Yield a bare array to have the harness recommend the proposal with the lowest loss so far; yield
+    an `Ask` to recommend another point. The recommendation is valid until the next `yield`.
 
     Attributes:
-        points: (n, dim) or (dim,) proposals, unit cube.
-        recommend: (dim,), unit cube, made from the evaluations received so far; None for the lowest
-            loss seen.
+        points: (n, dim) or (dim,) proposals in the unit cube.
+        recommend: (dim,) recommendation in the unit cube, made from the evaluations received so
+            far; None for the proposal with the lowest loss.
     """
 
     points: Array
@@ -50,17 +52,16 @@ class Ask(NamedTuple):
 
 
 Steps = Generator["Array | Ask", Evaluation, "str | None"]
-"""A tuner's run. Its return value, if any, is the reason for which it stopped by itself."""
+"""Run of a tuner; its return value, if any, is the reason why it stopped by itself."""
 
 
 class Scene(NamedTuple):
-    """What the experimenter knows of a target's scenario beside its observation.
+    """Scenario information: what is known of a target's scenario in addition to its observation.
 
     Attributes:
-        initial: (K,) initial values that no channel begins with, and constants of the run, run by
-            run in the order of their names, SI units.
-        inputs: (T, U) input signals in the order of their names, SI units; the runs follow one
-            another along T.
+        initial: (K,) initial values that no channel shows, and constants of the run, in SI units;
+            run by run, sorted by name.
+        inputs: (T, U) input signals in SI units, sorted by name; the runs are concatenated along T.
     """
 
     initial: Array
@@ -68,24 +69,24 @@ class Scene(NamedTuple):
 
 
 NOTHING = Scene(np.empty(0), np.empty((0, 0)))
-"""Nothing is known, or nothing worth telling."""
+"""Empty scenario information, if nothing relevant is known."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """Everything a tuner gets of one target; nothing here leads to its true parameters.
+    """Everything that a tuner gets of one target; it does not contain the true parameters.
 
     Attributes:
         dim: number of parameters.
-        start: (dim,) where every tuner starts on this target, unit cube.
-        observed: (T, C) the target's observation, SI units; NaN where a sample is missing. The runs
-            of a recording with several runs follow one another along T.
-        scale: (C,) what a residual is divided by: the channel's noise where known, else its typical
+        start: (dim,) point of the unit cube where every tuner starts on this target.
+        observed: (T, C) observation of the target in SI units; NaN for missing samples. The runs of
+            a recording with several runs are concatenated along T.
+        scale: (C,) divisor of the residuals: the channel's noise if known, else its typical
             magnitude.
-        training: (2, dim) lower and upper corner of the training range, unit cube.
-        budget: number of simulations the tuner may use.
-        lengths: number of samples of each run; they add up to T.
-        scene: what is known of the scenario beside the observation.
+        training: (2, dim) lower and upper corner of the training range in the unit cube.
+        budget: number of simulations that the tuner may use.
+        lengths: number of samples of each run; their sum is T.
+        scene: scenario information.
     """
 
     dim: int
@@ -98,26 +99,26 @@ class Task:
     scene: Scene = NOTHING
 
     def residuals(self, observations: Array) -> Array:
-        """Scaled differences simulated - observed, (n, T * C); zero where the target's sample is
-        missing.
+        """Compute scaled differences simulated - observed, shape (n, T * C).
+
+        They are zero where the target's sample is missing.
         """
         difference = (observations - self.observed) / self.scale
         return np.where(np.isnan(self.observed), 0.0, difference).reshape(len(observations), -1)
 
 
 class Practice(Protocol):
-    """The simulator as a learned tuner meets it in `fit`: counted, and fenced to the training
-    range.
+    """Training simulator of a learned tuner: counted, and limited to the training range.
 
     Attributes:
         dim: number of parameters.
-        training: (2, dim) corners of the training range, unit cube.
+        training: (2, dim) corners of the training range in the unit cube.
         scale: (C,) as in `Task`.
         lengths: as in `Task`.
-        scene: as in `Task`, of the scenario in which `simulate` was last called; of any before
-            that.
-        used: simulations made so far.
-        budget: simulations allowed.
+        scene: as in `Task`, for the scenario of the last call of `simulate`; before the first call,
+            for any scenario.
+        used: number of simulations made so far.
+        budget: number of simulations allowed.
     """
 
     dim: int
@@ -129,59 +130,77 @@ class Practice(Protocol):
     budget: int
 
     def sample(self, rng: np.random.Generator, n: int) -> Array:
-        """(n, dim) parameters drawn uniformly from the training range, unit cube."""
+        """Draw parameters uniformly from the training range.
+
+        Args:
+            rng: random generator.
+            n: number of points.
+
+        Returns:
+            (n, dim) points of the unit cube.
+        """
         ...
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
-        """Observations (n, T, C) of `points` (n, dim), all in one scenario drawn by `rng` as
-        targets' are.
+        """Simulate points, all in one scenario that is drawn in the same way as those of targets.
+
+        Args:
+            rng: random generator.
+            points: (n, dim) points of the unit cube.
+
+        Returns:
+            Observations (n, T, C).
 
         Raises:
-            ValueError: a point outside the training range.
-            BudgetExceededError: more simulations than the training budget.
+            ValueError: a point is outside the training range.
+            BudgetExceededError: more simulations are requested than the training budget allows.
         """
         ...
 
 
 class Watch(Protocol):
-    """Looks on while a learned tuner trains; what is learned is the same without it."""
+    """Callback that observes the training of a learned tuner, without any effect on its result."""
 
     @property
     def ground(self) -> Practice:
-        """More simulations of the training range, which only measure; the training budget does not
-        count them.
-        """
+        """Simulator of the training range for evaluation; the training budget does not count it."""
         ...
 
     def epoch(self, stage: str, epoch: int, epochs: int, loss: float, held_out: float) -> None:
-        """Told of each pass over the data of one stage of the training: its number from 1, and the
-        losses.
+        """Report one pass over the training data of one stage.
+
+        Args:
+            stage: name of the stage.
+            epoch: number of the pass, from 1.
+            epochs: number of passes.
+            loss: training loss.
+            held_out: loss on held-out data.
         """
         ...
 
 
 class BudgetExceededError(RuntimeError):
-    """A learned tuner asked for more training simulations than it was given."""
+    """A learned tuner requested more training simulations than it may use."""
 
 
 class Tuner:
-    """Base of all tuners. Subclasses implement `tune`; learned ones also `fit`, `state` and
-    `restore`.
+    """Base class of all tuners; subclasses implement `tune`.
 
-    Options are keyword arguments with defaults (a dataclass does well). An instance is used for one
-    run after another and must not keep anything from one to the next, except what `fit` learned.
+    Learned tuners also implement `fit`, `state` and `restore`. Options are keyword arguments with
+    defaults (a dataclass is suitable). An instance is used for several runs and must not store
+    anything between them, except what `fit` learned.
 
     Attributes:
-        name: how the tuner is called in tables; derived from the class name where not given
-            (RandomSearch -> random_search).
+        name: name of the tuner in tables; by default derived from the class name (RandomSearch ->
+            random_search).
         requires: importable packages without which this tuner is listed as skipped.
-        stochastic: whether `tune` uses its generator; where not, one seed tells all.
-        learned: whether `fit` must have been called before `tune`.
+        stochastic: whether `tune` uses its generator; if not, one seed is enough.
+        learned: whether `fit` must be called before `tune`.
         trains_as: another tuner that trains in the same way; its random stream is used, so that a
-            comparison of the two compares what they do with the same network.
-        known_failures: conformance checks (by function name) that it fails on purpose, with the
-            reason.
-        watch: looks on during `fit`, where the tuner tells it of its progress.
+            comparison of the two uses the same network.
+        known_failures: conformance checks (by function name) that the tuner fails on purpose, with
+            the reason.
+        watch: training callback for `fit`; None for none.
     """
 
     name: ClassVar[str] = ""
@@ -194,33 +213,45 @@ class Tuner:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        # of its own: a subclass of a named tuner is another tuner
+        # The class's own name: a subclass of a named tuner is another tuner.
         if "name" not in cls.__dict__:
             cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
-        """Yield proposals (n, dim) in the unit cube, receive their `Evaluation`; return a reason to
-        stop early.
+        """Yield proposals (n, dim) in the unit cube, and receive their `Evaluation`.
+
+        Args:
+            task: task of the target.
+            rng: random generator of the run.
+
+        Returns:
+            Generator of the run; it may return a reason to stop early.
         """
         raise NotImplementedError(f"{type(self).__name__} does not implement tune")
 
     def fit(self, simulator: Practice, rng: np.random.Generator, budget: int) -> None:
-        """Learn from at most `budget` simulations of the training range."""
+        """Learn from at most `budget` simulations of the training range.
+
+        Args:
+            simulator: training simulator.
+            rng: random generator.
+            budget: maximum number of simulations.
+        """
 
     def state(self) -> dict[str, Array]:
-        """What `fit` learned, as plain arrays by name."""
+        """Return what `fit` learned, as plain arrays by name."""
         return {}
 
     def restore(self, state: dict[str, Array]) -> None:
-        """Take back what `state` gave.
+        """Restore the arrays that `state` returned.
 
         Raises:
-            ValueError: arrays of other names or shapes than this tuner's.
+            ValueError: arrays have other names or shapes than this tuner's.
         """
 
 
 _PATIENCE = 5.0
-"""Seconds in which an optimiser must let go of its thread."""
+"""Timeout in seconds for the end of a callback optimiser's thread."""
 
 
 class _Stopped(BaseException):
@@ -230,12 +261,12 @@ class _Stopped(BaseException):
 def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) -> Steps:
     """Turn an optimiser that only takes an objective function into a tuner's generator.
 
-    The optimiser runs in a thread of its own and is never at work at the same time as the harness:
-    each call of the objective hands one point over and waits for its loss.
+    The optimiser runs in its own thread, and never at the same time as the harness: each call of
+    the objective passes one point to the harness and waits for its loss.
 
     Args:
-        minimise: called with the objective (dim,) -> loss; returns the reason for which it stopped,
-            or None. It must let exceptions of the objective through.
+        minimise: called with the objective (dim,) -> loss; returns the reason why it stopped, or
+            None. It must not catch exceptions of the objective.
 
     Returns:
         The generator; its return value is the reason.
@@ -244,7 +275,7 @@ def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) ->
     to_optimiser: list[float] = []
     outcome: list[str | None] = []
     failure: list[BaseException] = []
-    # each side waits for the other's semaphore, so that one of the two is at work at any time
+    # Each side waits for the other's semaphore, so that only one of the two runs at any time.
     asked = threading.Semaphore(0)
     answered = threading.Semaphore(0)
     closing = False
@@ -267,13 +298,13 @@ def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) ->
         except _Stopped:
             pass
         except BaseException as error:
-            # an exception that ends this thread would be lost; the harness files it
+            # An exception that ends this thread would be lost, so it is passed to the harness.
             failure.append(error)
         finally:
-            # nothing was handed over: that is how the harness learns that it is done
+            # Without a new point, the harness sees that the optimiser has ended.
             asked.release()
 
-    # a daemon, since an optimiser that never returns must not keep the process alive
+    # A daemon thread, because an optimiser that never returns must not keep the process alive.
     worker = threading.Thread(target=work, daemon=True, name="callback-optimiser")
     worker.start()
     try:
@@ -288,7 +319,7 @@ def from_callback(minimise: Callable[[Callable[[Array], float]], str | None]) ->
             to_optimiser.append(float(evaluation.losses[0]))
             answered.release()
     finally:
-        # the optimiser waits for a loss; it gets an exception in its place
+        # The optimiser waits for a loss, and gets an exception instead.
         closing = True
         answered.release()
         worker.join(timeout=_PATIENCE)

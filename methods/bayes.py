@@ -51,7 +51,7 @@ class Bayes(Tuner):
     noise: float | str = "gaussian"
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
-        """Ask, simulate, tell; the start comes first."""
+        """Propose one point at a time; the first one is the start."""
         with _quiet():
             optimiser = self.optimiser(task.dim, int(rng.integers(2**31)))
         point = task.start
@@ -59,7 +59,7 @@ class Bayes(Tuner):
         while True:
             evaluation = yield np.array(point)[None]
             loss = float(evaluation.losses[0])
-            # the library takes no infinite loss; one far above all others would flatten the process
+            # The library accepts no infinite loss; a very large one would flatten the process.
             if np.isfinite(loss):
                 worst = max(worst, loss)
             else:
@@ -69,7 +69,12 @@ class Bayes(Tuner):
                 point = optimiser.ask()
 
     def optimiser(self, dim: int, seed: int) -> Any:
-        """The library's own optimiser of the unit cube, with these options."""
+        """Make the library's optimiser of the unit cube with the options of this tuner.
+
+        Args:
+            dim: number of parameters.
+            seed: seed of the library's random generator.
+        """
         from skopt import Optimizer
         from skopt.utils import cook_estimator
 
@@ -92,15 +97,16 @@ class Bayes(Tuner):
                 "n_points": self.candidates,
                 "n_restarts_optimizer": self.polished,
             },
-            # the newest process alone: all of them would be kept
+            # Only the newest process is stored; by default all of them would be.
             model_queue_size=1,
             random_state=seed,
         )
 
 
 class _quiet(warnings.catch_warnings):  # noqa: N801 - used like a function
-    """scikit-optimize warns of each repeated point and of each fit that runs into a bound: silenced
-    here, locally.
+    """Context manager that ignores scikit-optimize's warnings.
+
+    It warns of each repeated point and of each fit that reaches a bound.
     """
 
     def __enter__(self) -> None:

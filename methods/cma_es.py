@@ -49,7 +49,7 @@ class CMAES(Tuner):
     restarts: bool = True
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
-        """One generation in one yield."""
+        """Propose one generation per yield."""
         if self.evaluate_start:
             yield task.start[None]
         centre = task.start
@@ -58,7 +58,7 @@ class CMAES(Tuner):
             strategy = self._strategy(centre, population, rng)
             while not strategy.stop():
                 generation = strategy.ask()
-                # without the coordinate that the simulation ignores
+                # The coordinate that the simulation ignores is removed.
                 points = np.array(generation)[:, : task.dim]
                 asked: Array | Ask = points
                 if self.recommend == "mean":
@@ -67,23 +67,25 @@ class CMAES(Tuner):
                 strategy.tell(generation, _finite(evaluation.losses))
             if not self.restarts:
                 return "pycma: " + ", ".join(strategy.stop())
-            # a larger population sees a rugged loss more coarsely; what overshoots would be cut
+            # A larger population is less sensitive to a rugged loss; points beyond the budget would
+            # be cut.
             centre = rng.uniform(size=task.dim)
             population = max(min(2 * strategy.popsize, task.budget), strategy.popsize)
 
     def _strategy(self, centre: Array, population: int | None, rng: np.random.Generator) -> Any:
-        """A strategy with a generator of its own: by default pycma seeds and uses NumPy's global
-        one.
+        """Make a strategy with its own random generator.
+
+        By default pycma seeds and uses NumPy's global generator.
         """
         import cma
 
         options: dict[str, Any] = {
             "bounds": [0.0, 1.0],
             "randn": lambda *shape: rng.standard_normal(shape),
-            # hands off the global generator
+            # NaN keeps pycma from seeding the global generator.
             "seed": np.nan,
             "verbose": -9,
-            # it would read options from a file in the working directory
+            # By default pycma reads options from a file in the working directory.
             "signals_filename": "",
         }
         if population is not None:
@@ -93,15 +95,15 @@ class CMAES(Tuner):
 
     @staticmethod
     def _mean(strategy: Any, dim: int) -> Array:
-        """The distribution's mean, in the cube."""
+        """Return the distribution's mean, clipped to the cube."""
         mean: Array = np.clip(strategy.result.xfavorite[:dim], 0.0, 1.0)
         return mean
 
 
 def _finite(losses: Array) -> Sequence[float]:
-    """Losses with failed simulations ranked last."""
+    """Return losses with failed simulations ranked last."""
     finite = np.isfinite(losses)
     worst = np.max(losses, where=finite, initial=0.0)
-    # only ranks count, so any number beyond the worst will do
+    # Only ranks matter, so any number larger than the worst loss is suitable.
     ranked = np.where(finite, losses, 10.0 * worst + 1.0)
     return [float(x) for x in ranked]

@@ -28,9 +28,9 @@ from methods.learning.gaussian_process import GaussianProcess, Settings
 from methods.learning.quasi_random import spread
 
 _PUBLISHED_DRAWS = 200
-"""Posterior draws of the published search."""
+"""Number of posterior samples of the published search."""
 _MANY = 20
-"""Simulations from which on the process's hyper-parameters are not fitted after each."""
+"""Number of simulations from which on hyper-parameters are not fitted after each simulation."""
 
 
 @dataclass(eq=False)
@@ -66,15 +66,15 @@ class EntropySearch(Tuner):
     refit: int = 3
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
-        """The published search, or the refined one."""
+        """Run the published search, or the refined one."""
         return self._published(task, rng) if self.published else self._refined(task, rng)
 
     def _published(self, task: Task, rng: np.random.Generator) -> Steps:
-        """A fixed grid; stops when the estimate repeats."""
+        """Search on a fixed grid, and stop when the estimate repeats."""
         grid = np.linspace(0.0, 1.0, self.grid)[:, None]
         if task.dim > 1:
             grid = spread(self.grid, rng.uniform(size=task.dim))
-        # a noise-free simulation; the little noise keeps the covariance invertible
+        # The simulation has no noise; a small noise variance keeps the covariance invertible.
         settings = Settings(kernel="rbf", noise=(1e-8, 0.01))
         points = np.empty((0, task.dim))
         losses = np.empty(0)
@@ -86,7 +86,7 @@ class EntropySearch(Tuner):
             points = np.vstack([points, evaluation.proposals])
             losses = np.append(losses, evaluation.losses)
             process = GaussianProcess(points, finite(losses), settings, hyper)
-            # the next fit begins where this one ended: one point more changes little
+            # The next fit starts from these values, because one more point changes them little.
             hyper = process.hyper
             p = minimiser_probability(process, grid, _PUBLISHED_DRAWS, rng)
             last = estimate
@@ -96,7 +96,7 @@ class EntropySearch(Tuner):
             proposal = grid[uncertainty(p).argmax()]  # (1)
 
     def _refined(self, task: Task, rng: np.random.Generator) -> Steps:
-        """New candidates for every simulation; never stops."""
+        """Search with new candidates for every simulation, without stopping."""
         design = spread(self.initial, rng.uniform(size=task.dim))
         points = np.empty((0, task.dim))
         losses = np.empty(0)
@@ -110,7 +110,7 @@ class EntropySearch(Tuner):
             if n < self.initial:
                 proposal = design[n]
                 continue
-            # near the minimum the loss spans decades, of which only a logarithm shows the last
+            # Near the minimum the loss spans several decades, which only a logarithm resolves.
             values = logarithm(finite(losses))
             fit = n < _MANY or n % self.refit == 0
             process = GaussianProcess(points, values, self.process, hyper, fit=fit)
@@ -118,21 +118,22 @@ class EntropySearch(Tuner):
             candidates = self._candidates(process, points[values.argmin()], rng)
             p = minimiser_probability(process, candidates, self.draws, rng)
             score = uncertainty(p)  # (1)
-            # the first candidate is simulated already
+            # The first candidate has already been simulated.
             proposal = candidates[score[1:].argmax() + 1]
 
     def _candidates(self, process: GaussianProcess, best: Array, rng: np.random.Generator) -> Array:
-        """The best point seen, quasi-random points, and points around the likely minimisers at all
-        scales.
+        """Choose the best point, quasi-random points, and points around likely minimisers.
+
+        The latter have distances of all orders of magnitude.
         """
         dim = len(best)
         wide = spread(self.everywhere, rng.uniform(size=dim))
         distances = np.linalg.norm(process.points - best, axis=1)
-        # from a tenth of the way to the nearest neighbour up to half the cube
+        # Distances range from a tenth of the distance to the nearest neighbour to half the cube.
         nearest = np.min(distances, where=distances > 0.0, initial=0.5)
         finest = max(0.1 * nearest, 1e-9)
         exponents = rng.uniform(np.log(finest), np.log(0.5), size=(self.nearby, 1))
-        # of like length in any number of dimensions
+        # The expected length is the same in any number of dimensions.
         scales = np.exp(exponents) / np.sqrt(dim)
         expected = wide[process.predict(wide).argmin()]
         even = np.arange(self.nearby)[:, None] % 2 == 0
@@ -144,25 +145,34 @@ class EntropySearch(Tuner):
 def minimiser_probability(
     process: GaussianProcess, candidates: Array, draws: int, rng: np.random.Generator
 ) -> Array:
-    """P (n,): the share of joint posterior draws whose minimiser each candidate (n, dim) is."""
+    """Compute the probability P (n,) that each candidate (n, dim) is the minimiser.
+
+    It is the share of joint posterior samples whose minimiser is the candidate.
+
+    Args:
+        process: Gaussian process of the loss.
+        candidates: (n, dim) points of the unit cube.
+        draws: number of posterior samples.
+        rng: random generator.
+    """
     minimisers = process.sample(candidates, draws, rng).argmin(axis=1)
     return np.bincount(minimisers, minlength=len(candidates)) / draws
 
 
 def uncertainty(p: Array) -> Array:
-    """-P log P, and -1 where P = 0, which is never chosen while there is anything else."""
+    """Compute -P log P, and -1 if P = 0, so that such a candidate is chosen last."""
     possible = p > 0.0
     logarithms = np.log(np.where(possible, p, 1.0))
     return np.where(possible, -p * logarithms, -1.0)
 
 
 def finite(losses: Array) -> Array:
-    """Losses with failed simulations as bad as the worst."""
+    """Replace the losses of failed simulations by the largest finite loss."""
     good = np.isfinite(losses)
     return np.where(good, losses, np.max(losses, where=good, initial=0.0))
 
 
 def logarithm(losses: Array) -> Array:
-    """Logarithm of the losses, with a floor far below the typical one."""
+    """Compute the logarithm of the losses, with a floor far below the typical loss."""
     values: Array = np.log(losses + 1e-6 * np.median(losses) + 1e-300)
     return values

@@ -23,7 +23,7 @@ from methods.least_squares import History, LeastSquares, LinearModel, Mask, Simu
 from methods.tunenet import SETTLED, RootSearch, TuneNet
 
 _EXACT = 1e-13
-"""Rounding: a loss below this share of the observation's root mean square."""
+"""Loss caused by rounding, as a share of the observation's root mean square."""
 _WHOLE = LeastSquares(
     (1.0,),
     ahead=True,
@@ -32,9 +32,9 @@ _WHOLE = LeastSquares(
     step_tolerance=_EXACT,
     reproduced=_EXACT,
 )
-"""All samples at once, for a start that is near."""
+"""Options of a least-squares fit of all samples at once, for a start near the solution."""
 _ACROSS = 0.5
-"""Share of a step that must lie across those already taken, for a secant that says more."""
+"""Minimum share of a step that is orthogonal to the chosen secants, for a further secant."""
 
 
 @dataclass(eq=False)
@@ -62,15 +62,15 @@ class Hybrid(TuneNet):
     near: float = 0.1
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
-        """Network steps, then a fit from there, then new starts."""
+        """Take network steps, then fit by least squares from there, then from new starts."""
         finish = LeastSquares(reproduced=_EXACT)
         run = History(task, _EXACT)
         enough = run.enough / _EXACT * finish.reproduced
         trusted = yield from self._approach(run, task)
-        # nothing to begin with: the middle of the training range is as good as any point
+        # Without any successful simulation, the middle of the training range is the start.
         if not np.isfinite(run.losses).any():
             yield from finish.fit_from(run, task.training.mean(axis=0))
-        # growing horizons only where all samples at once have failed: they cost simulations
+        # Growing horizons cost simulations, so they are used only if a fit of all samples failed.
         for fit in (_WHOLE, finish):
             if run.finished or not np.isfinite(run.losses).any():
                 break
@@ -85,7 +85,7 @@ class Hybrid(TuneNet):
         return "the simulation reproduces the target"
 
     def _approach(self, run: History, task: Task) -> Simulates[bool]:
-        """TuneNet's own steps, while they pay; returns whether they did to the end."""
+        """Take TuneNet's steps while they divide the loss; return whether they did to the end."""
         estimate = self.fitted().suited(task).estimator(task)
         search = RootSearch(task)
         guess = task.start
@@ -95,11 +95,11 @@ class Hybrid(TuneNet):
             evaluation = yield Ask(guess, recommend=guess)
             run.seen(evaluation)
             loss = float(evaluation.losses[0])
-            # the first simulation that succeeds has nothing to be compared with
+            # The first successful simulation has no loss to be compared with.
             pays = loss < self.pays * lowest or not np.isfinite(lowest)
             idle = 0 if pays else idle + 1
             lowest = min(lowest, loss)
-            # two in succession: one setback in a jagged loss is no sign
+            # A single increase of a jagged loss is not enough to stop.
             if idle == self.patience:
                 return False
             guess = search.after(evaluation.proposals[0], estimate(evaluation.observations))
@@ -108,8 +108,10 @@ class Hybrid(TuneNet):
         return idle == 0
 
     def _model(self, run: History, finish: LeastSquares) -> Simulates[LinearModel]:
-        """The linear model at the lowest loss: secants to points nearby, finite differences in what
-        they leave out.
+        """Build the linear model at the lowest loss.
+
+        Its Jacobian consists of secants to points nearby, and of finite differences in the
+        remaining directions.
         """
         finite = np.isfinite(run.losses)
         best = int(np.nanargmin(np.where(finite, run.losses, np.nan)))
@@ -121,7 +123,7 @@ class Hybrid(TuneNet):
         changes = [run.residuals[i] - residual for i in chosen]
         missing = _complement(basis, len(point))
         if len(missing):
-            # as long as the secants, so that all columns are as coarse
+            # Differences have the length of the secants, so that all columns have similar accuracy.
             size = float(np.abs(directions).max()) if chosen else finish.difference
             size = min(max(size, finish.smallest_difference), finish.difference)
             inward = np.where(missing @ (0.5 - point) < 0.0, -size, size)
@@ -130,7 +132,7 @@ class Hybrid(TuneNet):
             whole = ~np.isnan(residuals).any(axis=1)
             directions = np.concatenate([directions, (moved - point)[whole]])
             changes += list(residuals[whole] - residual)
-        # nothing succeeded nearby: no step at all is promised then
+        # If no simulation nearby succeeded, the model predicts no decrease.
         if not changes:
             return LinearModel(point, residual, np.zeros((len(residual), len(point))))
         solution = np.linalg.lstsq(directions, np.array(changes), rcond=None)[0]  # (1)
@@ -140,15 +142,24 @@ class Hybrid(TuneNet):
     def _secants(
         self, steps: Array, finite: Mask, smallest: float
     ) -> tuple[list[int], list[Array]]:
-        """Numbers of the steps (n, dim) that serve as secants, and an orthonormal basis of them."""
+        """Choose secants among steps from the best point.
+
+        Args:
+            steps: (n, dim) steps from the best point.
+            finite: (n,) mask of successful simulations.
+            smallest: minimum length of a secant.
+
+        Returns:
+            Indices of the chosen steps, and an orthonormal basis of them.
+        """
         lengths = np.abs(steps).max(axis=1)
-        # those nearer than the smallest difference differ by rounding
+        # Shorter steps than the smallest difference are dominated by rounding.
         usable = finite & (lengths <= self.near)
         usable &= lengths >= smallest
         nearest = np.argsort((steps**2).sum(axis=1), kind="stable")
         basis: list[Array] = []
         chosen: list[int] = []
-        # the nearest first, each by Gram and Schmidt
+        # The nearest points come first; each step is orthogonalised by Gram-Schmidt.
         for i in nearest[usable[nearest]]:
             step = steps[i]
             along = sum((q * (q @ step) for q in basis), np.zeros(len(step)))
@@ -161,9 +172,9 @@ class Hybrid(TuneNet):
 
 
 def _complement(basis: list[Array], dim: int) -> Array:
-    """Orthonormal directions (m, dim) across all of `basis`; the axes where it is empty."""
+    """Return orthonormal directions (m, dim) orthogonal to `basis`; the axes if it is empty."""
     if not basis:
         return np.eye(dim)
-    # the right singular vectors beyond the rank
+    # These are the right singular vectors beyond the rank.
     directions: Array = np.linalg.svd(np.array(basis))[2][len(basis) :]
     return directions

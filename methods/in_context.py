@@ -37,18 +37,18 @@ from methods.learning.sequence_training import Material, Watched, train
 from methods.tunenet import SETTLED
 
 _BOX = "box"
-"""Name of the array that holds the training range."""
+"""Name of the array with the training range."""
 
 
 @dataclass(frozen=True)
 class Learned:
-    """A trained network together with what it reads.
+    """A trained network with its input features.
 
     Attributes:
-        design: how the network is built.
-        read: observations and scenes to input rows.
-        weights: the network's arrays by name.
-        box: (2, dim) the training range, unit cube.
+        design: design of the network.
+        read: map from observations and scenarios to input rows.
+        weights: weight arrays by name.
+        box: (2, dim) training range in the unit cube.
     """
 
     design: Design
@@ -57,11 +57,17 @@ class Learned:
     box: Array
 
     def seen(self, rows: Array) -> Array:
-        """Input rows (n, D) through W (n, d)."""
+        """Project input rows (n, D) by W to (n, d)."""
         return rows @ self.weights["seen.weight"]
 
     def following(self, target: Array, shown: list[Array], tried: list[Array]) -> Array:
-        """What to try next (dim,), unit cube, of a target and simulations (d,) at points (dim,)."""
+        """Propose the next point (dim,) of the unit cube.
+
+        Args:
+            target: (d,) projected row of the target.
+            shown: projected rows (d,) of the simulations so far.
+            tried: points (dim,) of the simulations so far.
+        """
         window = self.design.window
         half = (self.box[1] - self.box[0]) / 2.0
         middle = self.box.mean(axis=0)
@@ -72,15 +78,20 @@ class Learned:
         return following
 
     def state(self) -> dict[str, Array]:
-        """Everything as plain arrays."""
+        """Return everything as plain arrays by name."""
         return self.read.state() | self.weights | {_BOX: self.box}
 
     @classmethod
     def restored(cls, state: dict[str, Array], design: Design, reading: Reading) -> Learned:
-        """The inverse of `state`.
+        """Restore a network from the arrays of `state`.
+
+        Args:
+            state: arrays by name.
+            design: design of the network.
+            reading: configuration of the inputs.
 
         Raises:
-            ValueError: arrays of other names or shapes, or numbers that are not finite.
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
         """
         read, arrays = Reader.restored(state, reading)
         dim = arrays.get("guess.bias", np.empty(0)).size
@@ -138,7 +149,7 @@ class InContext(Tuner):
     _prepared: Prepared[Learned] | None = None
 
     def design(self) -> Design:
-        """How the network is built and trained."""
+        """Return the design of the network."""
         return Design(
             self.window,
             published=self.published,
@@ -148,7 +159,7 @@ class InContext(Tuner):
         )
 
     def reading(self) -> Reading:
-        """What it reads."""
+        """Return the configuration of the inputs."""
         return Reading(
             self.points,
             self.inputs,
@@ -162,8 +173,13 @@ class InContext(Tuner):
     def fit(self, simulator: Practice, rng: np.random.Generator, budget: int) -> None:
         """Train on at most `budget` simulations of the training range.
 
+        Args:
+            simulator: training simulator.
+            rng: random generator.
+            budget: maximum number of simulations.
+
         Raises:
-            ValueError: a budget of less than two scenarios.
+            ValueError: the budget is smaller than two scenarios.
         """
         each = max(self.each, 2 * (simulator.dim + 1))
         data = rehearse(simulator, rng, budget, self.scenarios, each, binary_search)
@@ -171,7 +187,7 @@ class InContext(Tuner):
         apart = None
         if watch is not None:
             ground = watch.ground
-            # simulations of their own, from a stream of their own: training does not notice
+            # Separate simulations and a separate random stream do not affect the training.
             stream = np.random.default_rng(0)
             apart = rehearse(ground, stream, ground.budget, self.scenarios, each, binary_search)
         box = np.array(simulator.training, dtype=np.float64)
@@ -190,19 +206,19 @@ class InContext(Tuner):
         self._prepared = Prepared.train(data, rng, self.reading(), learned)
 
     def _histories(self, each: int, rng: np.random.Generator) -> Histories:
-        """Of a batch, from so many simulations in each scenario."""
+        """Draw the histories of a batch from `each` simulations per scenario."""
         window = min(self.window, each - 1)
         return in_order(each, window) if self.published else shuffled(rng, each, window)
 
     def state(self) -> dict[str, Array]:
-        """The network's weights and what it reads, by name; empty before `fit`."""
+        """Return weights and input features by name; empty before `fit`."""
         return {} if self._prepared is None else self._prepared.state()
 
     def restore(self, state: dict[str, Array]) -> None:
-        """Take back what `state` gave.
+        """Restore the arrays that `state` returned.
 
         Raises:
-            ValueError: arrays of other names or shapes, or numbers that are not finite.
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
         """
         design, reading = self.design(), self.reading()
         self._prepared = Prepared.restored(
@@ -210,7 +226,7 @@ class InContext(Tuner):
         )
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
-        """One simulation an iteration, until the proposal no longer changes."""
+        """Propose one point per iteration, until the proposal no longer changes."""
         if self._prepared is None:
             raise RuntimeError("in_context has not been trained; call fit or restore first")
         network = self._prepared.suited(task)
@@ -231,13 +247,14 @@ class InContext(Tuner):
                 if np.abs(guess - point).max() <= SETTLED:
                     return "the proposal no longer changes"
             else:
-                # half the way back to where one succeeded, or should
+                # Half the distance to the last successful point, or to the middle of the training
+                # range.
                 refuge = tried[-1] if tried else task.training.mean(axis=0)
                 guess = (point + refuge) / 2.0
 
 
 def _material(read: Reader, data: Rehearsal, box: Array) -> Material:
-    """What is learned from: histories see simulations as they are, targets through the sensor."""
+    """Build the training data: simulations without noise, targets with the sensor's noise."""
     half = (box[1] - box[0]) / 2.0
     parameters = (data.parameters - box.mean(axis=0)) / half
     target = read.table(data)

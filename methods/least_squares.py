@@ -39,20 +39,29 @@ from methods.base import Array, Ask, Evaluation, Steps, Task, Tuner
 
 Result = TypeVar("Result")
 Simulates = Generator["Array | Ask", Evaluation, Result]
-"""A part of a run: it may simulate, and returns a Result."""
+"""Part of a run: a generator that may simulate, and returns a Result."""
 Mask = NDArray[np.bool_]
 _POLISHED = 1e-8
-"""Share of the sum of squares that a step must promise on all samples."""
+"""Minimum predicted decrease of a step on all samples, as a share of the sum of squares."""
 _COARSE = 0.1
-"""The same on a horizon that only leads to the next, which need not be polished."""
+"""Minimum predicted decrease of a step on a shorter horizon, as a share of the sum of squares.
+
+It is larger than for all samples, because such a fit is only a start for the next horizon.
+"""
 _KEPT = 0.5
-"""Share of what was promised from which on a model is trusted."""
+"""Minimum ratio of actual to predicted decrease at which a linear model is trusted."""
 _DEAF = 1e-6
-"""Of the mean sensitivity over all samples: a horizon that responds less tells nothing."""
+"""Minimum mean squared sensitivity of a horizon, as a share of that of all samples.
+
+A horizon with a smaller one gives no information about the parameters.
+"""
 _FLAT = 1e-6
-"""Of the largest sensitivity: a parameter of less is damped as one of so much."""
+"""Minimum sensitivity for the damping, as a share of the largest one.
+
+A parameter with a smaller sensitivity is damped as if it had this one.
+"""
 _CANDIDATES = 64
-"""Random points, per parameter, of which a new start is the farthest from all tried ones."""
+"""Number of random points per parameter, from which a new start is chosen."""
 
 
 @dataclass(eq=False)
@@ -105,18 +114,28 @@ class LeastSquares(Tuner):
         return "the simulation reproduces the target"
 
     def fit_from(self, run: History, point: Array) -> Simulates[None]:
-        """One fit from `point`, of which nothing is known."""
+        """Fit from a point that has not been simulated.
+
+        Args:
+            run: history of the run.
+            point: (dim,) starting point in the unit cube.
+        """
         (residual,) = yield from run.simulate(point[None])
-        # without a residual there is nothing to differentiate
+        # Without a residual there is nothing to differentiate.
         if not np.isnan(residual).any():
             model = yield from self._differentiate(run, point, residual, self.difference)
             yield from self.fit_model(run, model)
 
     def fit_model(self, run: History, model: LinearModel) -> Simulates[None]:
-        """One fit over all horizons, beginning with a model."""
+        """Fit on all horizons in succession, beginning with a linear model.
+
+        Args:
+            run: history of the run.
+            model: linear model at the starting point.
+        """
         for share in self.horizons:
             chosen = run.samples(share)
-            # before the first impact nothing may depend on the parameters
+            # Before the first impact the samples may not depend on the parameters.
             if share >= 1.0 or model.sensitive(chosen):
                 model = yield from self._descend(run, model, chosen)
             if run.finished:
@@ -125,8 +144,9 @@ class LeastSquares(Tuner):
     def _differentiate(
         self, run: History, point: Array, residual: Array, longest: float
     ) -> Simulates[LinearModel]:
-        """One-sided differences, inward at the upper border; to the other side where a simulation
-        failed.
+        """Compute one-sided differences, inward at the upper bound.
+
+        If a simulation fails, the difference is taken on the other side.
         """
         h = min(max(longest, self.smallest_difference), self.difference)
         steps = np.where(point + h > 1.0, -h, h)
@@ -136,11 +156,11 @@ class LeastSquares(Tuner):
             steps[failed] *= -1.0
             moved[failed] = yield from run.simulate(point + np.diag(steps)[failed])
         slopes = (moved - residual) / steps[:, None]
-        # where both sides fail, the column stays zero
+        # If both sides fail, the column stays zero.
         return LinearModel(point, residual, np.nan_to_num(slopes).T)
 
     def _descend(self, run: History, model: LinearModel, chosen: Mask) -> Simulates[LinearModel]:
-        """Levenberg-Marquardt on the chosen samples until they are fitted, or it is stuck."""
+        """Run Levenberg-Marquardt on the chosen samples until convergence or lack of progress."""
         worthwhile = _POLISHED if chosen.all() else _COARSE
         damping = _Damping(self.damping)
         stalled = 0
@@ -151,14 +171,15 @@ class LeastSquares(Tuner):
             if np.abs(step).max() < self.step_tolerance or promised <= worthwhile * before:
                 break
             proposal = model.point + step
-            # on an early horizon, or after a broken promise, a step is a guess
+            # On a short horizon, or after a wrong prediction, a step is too uncertain to be
+            # recommended.
             trusted = self.ahead and model.trusted and chosen.all()
             hopeful = proposal if trusted else None
             (residual,) = yield from run.simulate(proposal[None], hopeful)
-            # NaN where the simulation failed, which compares as no better
+            # The error is NaN if the simulation failed, and then `better` is False.
             after = float(residual[chosen] @ residual[chosen])
             better = after < before
-            # a step that failed to lead down still tells the slope along it
+            # A step that increased the error still gives information about the slope along it.
             if np.isfinite(after):
                 model.update(step, residual)
             if better:
@@ -171,7 +192,7 @@ class LeastSquares(Tuner):
             stalled = 0 if after < (1.0 - self.progress) * before else stalled + 1
             if run.finished:
                 break
-            # with one parameter the secant is the slope; with several it may have gone stale
+            # With one parameter the secant is the slope; with several the secants may be outdated.
             stale = failed == 2 and len(step) > 1
             if stale or (better and not self.secant):
                 longest = float(np.abs(step).max())
@@ -181,18 +202,23 @@ class LeastSquares(Tuner):
 
 @dataclass
 class _Damping:
-    """Nielsen's rule (3): gentle where the model is good, ever stronger where it fails."""
+    """Damping by Nielsen's rule (3): smaller after good predictions, larger after bad ones."""
 
     mu: float
     nu: float = 2.0
 
     def adapt(self, gain: float) -> None:
-        """`gain`: decrease as a share of what the model promised; NaN for a failed simulation."""
+        """Adapt the damping to the result of a step.
+
+        Args:
+            gain: ratio of actual to predicted decrease; NaN for a failed simulation.
+        """
         if gain > 0.0:
             self.mu *= max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
             self.nu = 2.0
         elif np.isnan(gain):
-            # a quarter of the step, where the parameters do not interact: (1) divides by 1 + mu
+            # The step becomes a quarter if the parameters do not interact, because (1) divides by 1
+            # + mu.
             self.mu = 4.0 * self.mu + 3.0
         else:
             self.mu *= self.nu
@@ -201,10 +227,13 @@ class _Damping:
 
 @dataclass
 class LinearModel:
-    """The residual near a point: r(θ + s) ≈ residual + jacobian s; arrays (dim,), (samples,),
-    (samples, dim).
+    """Linear model of the residual near a point: r(θ + s) ≈ residual + jacobian s.
 
-    `trusted` where the last step did at least half of what was promised.
+    Attributes:
+        point: (dim,) point of the unit cube.
+        residual: (samples,) residual at the point.
+        jacobian: (samples, dim) Jacobian at the point.
+        trusted: whether the last step gave at least half of the predicted decrease.
     """
 
     point: Array
@@ -213,44 +242,67 @@ class LinearModel:
     trusted: bool = False
 
     def error(self, chosen: Mask) -> float:
-        """Sum of squares of the chosen samples."""
+        """Return the sum of squares of the chosen samples."""
         return float(self.residual[chosen] @ self.residual[chosen])
 
     def sensitive(self, chosen: Mask) -> bool:
-        """Whether the chosen samples respond to any parameter, compared with all samples."""
+        """Return whether the chosen samples are sensitive to any parameter.
+
+        Their sensitivity is compared with that of all samples.
+        """
         here = (self.jacobian[chosen] ** 2).mean()
         return bool(here > _DEAF * (self.jacobian**2).mean())
 
     def step(self, chosen: Mask, mu: float) -> tuple[Array, float]:
-        """The step (1) within the cube, and the decrease of the sum of squares that it promises."""
+        """Compute the step (1) within the cube, and the predicted decrease of the sum of squares.
+
+        Args:
+            chosen: mask of the fitted samples.
+            mu: damping.
+        """
         r = self.residual[chosen]
         jacobian = self.jacobian[chosen]
         gradient = jacobian.T @ r
-        # a parameter at a border that would leave the cube stays there
+        # A parameter at a bound that would leave the cube stays at the bound.
         below = (self.point <= 0.0) & (gradient > 0.0)
         above = (self.point >= 1.0) & (gradient < 0.0)
         free = ~(below | above)
         scale = np.sqrt((jacobian**2).sum(0))
         scale = np.maximum(scale, _FLAT * scale.max())
-        # (1) as a least-squares problem, which does not square the condition of J
+        # (1) is solved as a least-squares problem, which does not square the condition number of J.
         stacked = np.vstack([jacobian, np.diag(np.sqrt(mu) * scale)])[:, free]
         step = np.zeros_like(self.point)
         target = np.append(-r, np.zeros_like(step))
         step[free] = np.linalg.lstsq(stacked, target, rcond=None)[0]
-        # what leaves the cube on the way is cut, and the promise is that of the cut step
+        # The step is clipped to the cube, and the predicted decrease is that of the clipped step.
         step = np.clip(self.point + step, 0.0, 1.0) - self.point
         remaining = r + jacobian @ step
         return step, float(r @ r - remaining @ remaining)
 
     def update(self, step: Array, residual: Array) -> None:
-        """Broyden's update: the smallest change of the Jacobian that explains what the step did."""
+        """Apply Broyden's update, the smallest Jacobian change that explains a step's result.
+
+        Args:
+            step: (dim,) step from the point.
+            residual: (samples,) residual after the step.
+        """
         missed = residual - self.residual - self.jacobian @ step
         self.jacobian = self.jacobian + np.outer(missed, step / (step @ step))  # (4)
 
 
 @dataclass
 class History:
-    """What one run has simulated."""
+    """Record of everything that one run has simulated.
+
+    Attributes:
+        task: task of the target.
+        reproduced: loss at which the target counts as reproduced, as a share of the observation's
+            root mean square.
+        tried: simulated points.
+        residuals: residual of each point; NaN if the simulation failed.
+        losses: loss of each point.
+        finished: whether the target has been reproduced.
+    """
 
     task: Task
     reproduced: float
@@ -264,13 +316,21 @@ class History:
         self.enough = self.reproduced * float(np.sqrt(np.mean(observed**2)))
 
     def simulate(self, points: Array, recommend: Array | None = None) -> Simulates[Array]:
-        """Residuals (n, samples) of the points; rows of NaN where the simulation failed."""
+        """Simulate points.
+
+        Args:
+            points: (n, dim) points, which are clipped to the unit cube.
+            recommend: (dim,) recommended point; None for the lowest loss so far.
+
+        Returns:
+            Residuals (n, samples); rows of NaN if the simulation failed.
+        """
         points = np.clip(points, 0.0, 1.0)
         evaluation = yield points if recommend is None else Ask(points, recommend)
         return self.seen(evaluation)
 
     def seen(self, evaluation: Evaluation) -> Array:
-        """Note what was simulated; its residuals."""
+        """Record an evaluation, and return its residuals."""
         proposals, observations, losses = evaluation
         finite = np.isfinite(losses)
         residuals = np.where(finite[:, None], self.task.residuals(observations), np.nan)
@@ -281,12 +341,12 @@ class History:
         return residuals
 
     def samples(self, share: float) -> Mask:
-        """Which residuals belong to the first `share` of their run."""
+        """Return the mask of the residuals in the first `share` of their run."""
         first = np.concatenate([np.arange(n) < share * n for n in self.task.lengths])
         return np.repeat(first, self.task.observed.shape[1])
 
     def untried(self, rng: np.random.Generator) -> Array:
-        """The point farthest from all tried ones, among random candidates."""
+        """Return the random candidate point that is farthest from all simulated points."""
         dim = self.task.dim
         candidates = rng.uniform(size=(_CANDIDATES * dim, dim))
         squares = [((candidates - point) ** 2).sum(1) for point in self.tried]

@@ -38,7 +38,7 @@ class NelderMead(Tuner):
     step_tolerance: float = 0.0
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
-        """Hand nlopt's questions over one by one."""
+        """Pass nlopt's points to the harness one by one."""
         return from_callback(lambda loss: self._minimise(task, loss))
 
     def _minimise(self, task: Task, loss: Callable[[Array], float]) -> str:
@@ -46,7 +46,7 @@ class NelderMead(Tuner):
 
         def objective(point: Array, gradient: Array) -> float:  # noqa: ARG001 - nlopt's signature
             value = loss(point)
-            # NaN compares with nothing: the simplex could not order its corners
+            # The simplex could not sort its corners with NaN.
             return value if np.isfinite(value) else np.inf
 
         optimiser = nlopt.opt(nlopt.LN_NELDERMEAD, task.dim)
@@ -59,6 +59,6 @@ class NelderMead(Tuner):
         try:
             optimiser.optimize(task.start)
         except nlopt.RoundoffLimited:
-            # with a tolerance of 0 the usual end, and no fault
+            # With a tolerance of 0 this is the usual end, and not an error.
             return "the simplex reached the limit of rounding"
         return "the simplex has collapsed to a point"

@@ -75,15 +75,21 @@ class NPE(Tuner):
     def fit(self, simulator: Practice, rng: np.random.Generator, budget: int) -> None:
         """Train on at most `budget` simulations of the training range.
 
+        Args:
+            simulator: training simulator.
+            rng: random generator.
+            budget: maximum number of simulations.
+
         Raises:
-            ValueError: a budget of less than two scenarios.
+            ValueError: the budget is smaller than two scenarios.
         """
         dim = simulator.dim
         each = max(self.each, 2 * (dim + 1))
         data = rehearse(simulator, rng, budget, self.scenarios, each)
         spoilt = data.spoilt(self.noise * data.flat.std(axis=(0, 1)), rng)
         self._read = read = Reader.learned(data, self._reading())
-        # each simulation twice, clean and spoilt: targets may be either
+        # Each simulation is used twice, with and without noise, because targets may be of either
+        # kind.
         rows = np.concatenate([read.table(some).reshape(-1, read.size) for some in (data, spoilt)])
         theta = np.tile(data.parameters.reshape(-1, dim), (2, 1))
         with quietly(rng):
@@ -95,7 +101,7 @@ class NPE(Tuner):
                 show_progress_bars=False,
             )
             trainer.append_simulations(_tensor(theta), _tensor(rows))
-            # (1), until the loss of the rows that sbi holds out no longer falls
+            # The minimum (1), until the loss of sbi's held-out rows no longer decreases.
             self._flow = trainer.train(
                 max_num_epochs=self.epochs,
                 training_batch_size=min(100, len(rows) // 4),
@@ -115,7 +121,7 @@ class NPE(Tuner):
         return builder
 
     def state(self) -> dict[str, Array]:
-        """The flow's tensors and what it reads, by name; empty before `fit`."""
+        """Return the flow's tensors and the input features by name; empty before `fit`."""
         if self._read is None:
             return {}
         tensors = {
@@ -124,10 +130,10 @@ class NPE(Tuner):
         return tensors | self._read.state()
 
     def restore(self, state: dict[str, Array]) -> None:
-        """Take back what `state` gave.
+        """Restore the arrays that `state` returned.
 
         Raises:
-            ValueError: arrays of other names or shapes, or numbers that are not finite.
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
         """
         flow = {name: array for name, array in state.items() if name.startswith("flow.")}
         others = {name: array for name, array in state.items() if name not in flow}
@@ -143,7 +149,7 @@ class NPE(Tuner):
         self._read = read
 
     def _rebuilt(self, arrays: dict[str, Array], inputs: int) -> Any:
-        """A flow of the default build with these tensors; its number of parameters is what fits."""
+        """Rebuild a flow of the default design from its tensors, which determine its dimension."""
         import torch
 
         sizes = {a.size for name, a in arrays.items() if name.endswith("_transforms.0._shift")}
@@ -152,7 +158,7 @@ class NPE(Tuner):
             raise ValueError("expected the arrays of a flow, found others")
         rng = np.random.default_rng(0)
         with quietly(rng):
-            # sbi reads the sizes off example data; its scaling comes with the tensors
+            # sbi takes the sizes from example data; the scaling is part of the tensors.
             theta = _tensor(rng.standard_normal((4, dim)))
             rows = _tensor(rng.standard_normal((4, inputs)))
             flow = self._builder()(theta, rows)
@@ -167,7 +173,7 @@ class NPE(Tuner):
         return flow
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
-        """The posterior's mean, then draws."""
+        """Propose the mean of the posterior, then samples of it."""
         if self._read is None:
             raise RuntimeError("npe has not been trained; call fit or restore first")
         row = self._read(task.observed[None], task.lengths, task.scene)
@@ -175,7 +181,7 @@ class NPE(Tuner):
             count = max(self.draws, task.budget)
             samples = self._flow.sample((count,), condition=_tensor(row))
             raw = samples.detach()[:, 0].numpy()
-        # a flow has mass beyond the range it was trained on, and may overflow far from it
+        # A flow has mass outside the range of its training, and may overflow far from it.
         draws = np.clip(np.nan_to_num(raw.astype(np.float64), nan=0.5), 0.0, 1.0)
         mean = draws.mean(axis=0)
         yield Ask(mean, recommend=mean)

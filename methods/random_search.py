@@ -21,7 +21,7 @@ class RandomSearch(Tuner):
     known_failures = {"check_beats_random_search": "it is random search"}  # noqa: RUF012
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
-        """One point at a time, for ever."""
+        """Propose one random point at a time, without end."""
         yield task.start[None]
         while True:
             yield rng.uniform(size=(1, task.dim))

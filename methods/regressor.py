@@ -58,10 +58,10 @@ class Regressor(PairTuner):
     clean: bool = True
 
     def design(self) -> Design:
-        """How the network is built and trained."""
+        """Return the design of the network."""
         if self.published:
             return PUBLISHED
-        # its two inputs are no pair that could change places
+        # The two inputs of this network are not a pair that could be exchanged.
         return Design(
             antisymmetric=False,
             epochs=self.epochs,
@@ -70,7 +70,7 @@ class Regressor(PairTuner):
         )
 
     def reading(self) -> Reading:
-        """What it reads."""
+        """Return the configuration of the inputs."""
         if self.published:
             return Reading(self.points, noise=0.0, raw=True)
         return Reading(
@@ -84,17 +84,18 @@ class Regressor(PairTuner):
         )
 
     def layout(self, dim: int) -> tuple[int, int]:
-        """Training scenarios at most, and simulations in each."""
+        """Return the maximum number of training scenarios and the number of simulations in each."""
         if self.published:
             return 800, 1
-        # enough for a linear fit of the parameters in each scenario, and as many to judge it by
+        # Half of them are enough for a linear fit of the parameters; the others are for its
+        # residual.
         return self.scenarios, max(self.each, 2 * (dim + 1))
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
-        """One estimate from the target, simulated once."""
+        """Propose one estimate from the target, and stop after its simulation."""
         network = self.fitted().suited(task)
         target = network.read(task.observed[None], task.lengths, task.scene)[0]
-        # the proposed input is zero, so the difference is the parameters themselves
+        # The proposed input is zero, so the difference is the parameters themselves.
         nothing = np.zeros_like(target)
         guess = np.clip(network.difference(nothing, target), 0.0, 1.0)
         yield Ask(guess, recommend=guess)

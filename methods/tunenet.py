@@ -81,11 +81,11 @@ class TuneNet(PairTuner):
     broyden: bool = True
 
     def design(self) -> Design:
-        """How the network is built and trained."""
+        """Return the design of the network."""
         return Design(epochs=self.epochs, rate=self.rate, weight_decay=self.weight_decay)
 
     def reading(self) -> Reading:
-        """What it reads."""
+        """Return the configuration of the inputs."""
         return Reading(
             self.points,
             self.inputs,
@@ -97,11 +97,11 @@ class TuneNet(PairTuner):
         )
 
     def layout(self, dim: int) -> tuple[int, int]:
-        """Training scenarios at most, and simulations in each."""
+        """Return the maximum number of training scenarios and the number of simulations in each."""
         return self.scenarios, max(self.each, 2 * (dim + 1))
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
-        """Algorithm 1, one simulation an iteration."""
+        """Run Algorithm 1, with one simulation per iteration."""
         estimate = self.fitted().suited(task).estimator(task)
         search = RootSearch(task)
         guess = task.start
@@ -114,7 +114,7 @@ class TuneNet(PairTuner):
                 if np.abs(guess - search.best).max() <= SETTLED:
                     return "the estimate no longer changes"
             else:
-                # (1); a simulation that failed tells nothing, and its point is tried again
+                # This is (1); a failed simulation gives no information, and its point is repeated.
                 guess = np.clip(point + np.nan_to_num(residual), 0.0, 1.0)
 
 
@@ -137,19 +137,19 @@ class TuneNetPublished(PairTuner):
     points: int = 400
 
     def design(self) -> Design:
-        """How the network is built and trained."""
+        """Return the published design of the network."""
         return PUBLISHED
 
     def reading(self) -> Reading:
-        """What it reads."""
+        """Return the configuration of the inputs."""
         return Reading(self.points, noise=0.0, raw=True)
 
     def layout(self, dim: int) -> tuple[int, int]:  # noqa: ARG002 (the contract's signature)
-        """Training scenarios at most, and simulations in each."""
+        """Return the maximum number of training scenarios and the number of simulations in each."""
         return 800, 2
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:  # noqa: ARG002
-        """Algorithm 1; guesses are kept from falling below zero, and from nothing else."""
+        """Run Algorithm 1; guesses are limited to non-negative values only, as published."""
         estimate = self.fitted().suited(task).estimator(task)
         guess = task.start
         while True:
@@ -159,18 +159,25 @@ class TuneNetPublished(PairTuner):
 
 
 SETTLED = 1e-10
-"""A step as small as this is rounding, unit cube."""
+"""Step length in the unit cube below which a step is rounding."""
 
 
 _LONGEST = 2.0
-"""Broyden's step against that of Algorithm 1, at most."""
+"""Maximum length of a Broyden step, in multiples of the step of Algorithm 1."""
 _REACH = 10.0
-"""The same of a step that halves an interval."""
+"""Maximum length of a bisection step, in multiples of the step of Algorithm 1."""
 
 
 class RootSearch:
-    """Broyden's method on h(simulation of x, target) = 0, beginning with the step of Algorithm 1:
-    slope -1.
+    """Broyden's method for h(simulation of x, target) = 0.
+
+    The initial slope is -1, so that the first step is that of Algorithm 1.
+
+    Args:
+        task: task of the target.
+
+    Attributes:
+        best: (dim,) point with the smallest estimated difference so far.
     """
 
     def __init__(self, task: Task) -> None:
@@ -179,15 +186,24 @@ class RootSearch:
         self._last: tuple[Array, Array] | None = None
         self._residual: Array | None = None
         self._setbacks = 0
-        # in one dimension: the largest point known to be too low, the smallest too high
+        # In one dimension: the largest point known to be too low, and the smallest known too high.
         self._low = -np.inf
         self._high = np.inf
         self.best = task.start
 
     def after(self, point: Array, residual: Array) -> Array:
-        """The next guess, once `residual` has been seen at `point`."""
+        """Compute the next guess.
+
+        Args:
+            point: (dim,) simulated point.
+            residual: (dim,) estimate h at this point; NaN if the simulation failed.
+
+        Returns:
+            (dim,) point of the unit cube.
+        """
         if not np.isfinite(residual).all():
-            # the simulation failed: half the way back to where one succeeded, or should
+            # The simulation failed: go half the way to the best point, or to the middle of the
+            # training range.
             refuge = self._fallback if self._residual is None else self.best
             return (point + refuge) / 2.0
         if self._last is not None:
@@ -203,24 +219,24 @@ class RootSearch:
         return self._bracketed(guess, point, residual) if len(point) == 1 else guess
 
     def _learn(self, step: Array, change: Array) -> None:
-        """Broyden's update (3); a step of no length teaches nothing."""
+        """Apply Broyden's update (3); a step of length zero is ignored."""
         square = step @ step
         if square > 0.0:
             missed = change - self._slope @ step
             self._slope = self._slope + np.outer(missed, step) / square
 
     def _step(self, residual: Array) -> Array:
-        """Broyden's step from the best point, at most twice Algorithm 1's; the latter where the
-        former turns back.
+        """Compute Broyden's step from the best point, at most twice as long as Algorithm 1's.
 
-        The first setback has its remedy in the slope that it taught; after more of them the step is
-        halved each time.
+        If it points against the estimate, Algorithm 1's step is used. After the first setback the
+        updated slope is enough; after each further one the step is halved.
         """
         try:
             step = np.linalg.solve(self._slope, -residual)  # (2)
         except np.linalg.LinAlgError:
             step = residual
-        # against the estimate itself: then the slope is wrong, since h is trained to point right
+        # If the step points against the estimate, the slope is wrong, because h is trained to have
+        # the right direction.
         if not step @ residual > 0.0:
             step = residual
         length = max(float(np.linalg.norm(step)), 1e-300)
@@ -229,17 +245,17 @@ class RootSearch:
         return np.asarray(step * share, dtype=np.float64)
 
     def _bracketed(self, guess: Array, point: Array, residual: Array) -> Array:
-        """In one dimension, after a setback, keep between a point that was too low and one that was
-        too high.
+        """Limit the guess in one dimension to the interval between a low and a high point.
 
-        Halfway to the other end is far where that was one of the first points; what is nearly right
-        already then needs no such step, and where the estimates are rough it would be lost.
+        This is done after a setback. The step to the middle of the interval is limited, because the
+        middle is far away if the other end is one of the first points; a guess that is already
+        close would be lost if the estimates are inaccurate.
         """
         if residual[0] > 0.0:
             self._low = max(self._low, point[0])
         elif residual[0] < 0.0:
             self._high = min(self._high, point[0])
-        # rough estimates may contradict each other, and then there is no interval
+        # Inaccurate estimates may contradict each other; then there is no interval.
         known = np.isfinite([self._low, self._high]).all() and self._low < self._high
         if self._setbacks and known and not self._low < guess[0] < self._high:
             far = 1.0

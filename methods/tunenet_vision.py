@@ -12,7 +12,7 @@ from methods.learning.reader import Reading
 from methods.tunenet import TuneNet
 
 _LAST = 1_000_000
-"""As many channels as there may be."""
+"""Index of the last channel, larger than any number of channels."""
 
 
 @dataclass(eq=False)
@@ -46,11 +46,11 @@ class TuneNetVision(TuneNet):
     clean: bool = False
 
     def design(self) -> Design:
-        """How the network is built and trained."""
+        """Return the design of the network."""
         return replace(super().design(), antisymmetric=False)
 
     def reading(self) -> Reading:
-        """What each side reads."""
+        """Return the configuration of the inputs of both sides."""
         target = super().reading()
-        # the simulation shows heights whatever the camera is
+        # The simulation shows heights, which do not depend on the camera.
         return replace(target, proposed=replace(target, told=False, channels=(0, 0)))

@@ -26,19 +26,22 @@ from methods.base import Array, Steps, Task, Tuner
 from methods.learning.quiet import quietly
 
 _BETTER = 0.999
-"""Of the lowest loss: what is not below it is no improvement."""
+"""Factor of the lowest loss; only a loss below this product counts as an improvement."""
 _FAILURES = 4
-"""Failures in succession, at least, after which the side is halved."""
+"""Minimum number of successive failures after which the side length is halved."""
 _MOVED = 20.0
-"""Coordinates in which a candidate differs from the centre, on average at most."""
+"""Maximum mean number of coordinates in which a candidate differs from the centre."""
 _SHORTEST_SCALE = 0.005
-"""Least length scale of the process, unit cube."""
+"""Minimum length scale of the process, in the unit cube."""
 _LONGEST_SCALE = 4.0
-"""Largest length scale of the process, unit cube."""
+"""Maximum length scale of the process, in the unit cube."""
 _LEAST_NOISE = 1e-8
-"""Least variance of the noise, losses being scaled to variance 1."""
+"""Minimum variance of the noise, for losses scaled to variance 1."""
 _MOST_NOISE = 1e-3
-"""Largest variance of the noise: simulations repeat exactly."""
+"""Maximum variance of the noise, for losses scaled to variance 1.
+
+It is small, because simulations are reproducible.
+"""
 
 
 @dataclass(eq=False)
@@ -71,14 +74,15 @@ class TuRBO(Tuner):
     successes: int = 3
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
-        """Initial points, then one Thompson sample at a time; again from new points when the region
-        has collapsed.
+        """Propose initial points, then one Thompson sample at a time.
+
+        When the trust region has collapsed, start again from new initial points.
         """
         first: Array | None = task.start
         while True:
             count = max(2, self.initial * task.dim)
             points = list(_spread(rng, count, task.dim))
-            # the start belongs to the first region alone
+            # The start is used in the first region only.
             if first is not None:
                 points[0] = first
                 first = None
@@ -89,7 +93,7 @@ class TuRBO(Tuner):
             yield from self._region(task.dim, rng, np.array(points), np.array(losses))
 
     def _region(self, dim: int, rng: np.random.Generator, points: Array, losses: Array) -> Steps:
-        """One trust region, until it has collapsed."""
+        """Search in one trust region until it has collapsed."""
         length = self.length
         succeeded = 0
         failed = 0
@@ -97,7 +101,7 @@ class TuRBO(Tuner):
             point = self._sampled(points, losses, length, rng)
             evaluation = yield point
             loss = float(evaluation.losses[0])
-            # a gain by rounding is no success
+            # An improvement by rounding does not count as success.
             if loss < _BETTER * losses.min():
                 succeeded += 1
                 failed = 0
@@ -117,7 +121,7 @@ class TuRBO(Tuner):
     def _sampled(
         self, points: Array, losses: Array, length: float, rng: np.random.Generator
     ) -> Array:
-        """The best of a Thompson sample of the process over candidates in the trust region."""
+        """Return the best candidate of a Thompson sample of the process in the trust region."""
         import torch
 
         finite = np.isfinite(losses)
@@ -143,21 +147,22 @@ class TuRBO(Tuner):
         return best
 
     def _candidates(self, centre: Array, sides: Array, rng: np.random.Generator) -> Array:
-        """Points in the box around `centre`; in many dimensions each differs from it in about 20 of
-        them.
+        """Draw points in the box around `centre`.
+
+        In many dimensions each one differs from the centre in about 20 coordinates.
         """
         dim = len(centre)
         low = np.clip(centre - sides / 2.0, 0.0, 1.0)
         high = np.clip(centre + sides / 2.0, 0.0, 1.0)
         spread = low + (high - low) * _spread(rng, self.candidates, dim)
         moved = rng.uniform(size=spread.shape) <= min(_MOVED / dim, 1.0)
-        # the centre itself has been simulated
+        # At least one coordinate is changed, because the centre has already been simulated.
         moved[~moved.any(axis=1), rng.integers(dim)] = True
         return np.where(moved, spread, centre)
 
 
 def _spread(rng: np.random.Generator, n: int, dim: int) -> Array:
-    """Scrambled Sobol points (n, dim)."""
+    """Return scrambled Sobol points (n, dim)."""
     from scipy.stats import qmc
 
     with warnings.catch_warnings():
@@ -167,7 +172,7 @@ def _spread(rng: np.random.Generator, n: int, dim: int) -> Array:
 
 
 def _process(points: Array, values: Array) -> Any:
-    """A Gaussian process with a scaled Matérn-5/2 kernel, fitted by its marginal likelihood."""
+    """Fit a Gaussian process with a scaled Matérn-5/2 kernel by its marginal likelihood."""
     import torch
     from botorch.exceptions.errors import ModelFittingError
     from botorch.fit import fit_gpytorch_mll
@@ -190,10 +195,10 @@ def _process(points: Array, values: Array) -> Any:
         y,
         covar_module=ScaleKernel(kernel),
         likelihood=likelihood,
-        # losses are scaled before
+        # Losses have already been scaled.
         outcome_transform=None,
     )
-    # where the fit fails, the kernel as it stands serves as well
+    # If the fit fails, the initial kernel is used.
     with suppress(ModelFittingError):
         fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
     return model.eval()

@@ -1,9 +1,9 @@
-"""When training pays: simulations of learned and of search tuners over many targets, and who wins
-at which cost.
+"""Compare the training cost of learned tuners with the cost of search tuners.
 
-A learned tuner costs its training once and little on each target. `break_even` says from how many
-targets on the sum is below a search tuner's; `winners` who needs the least time when a simulation
-takes c seconds.
+A learned tuner has a training cost, which is paid once, and a small cost for each target.
+`break_even` computes the number of targets from which its total number of simulations is below the
+one of a search tuner. `winners` finds the tuner that needs the least time when a simulation takes c
+seconds.
 """
 
 from __future__ import annotations
@@ -35,25 +35,27 @@ EVEN_COLUMNS = [
     "high",
 ]
 COSTS: Array = np.logspace(-6, 3, 181)
-"""Seconds that a simulation may take."""
+"""Durations of one simulation for which tuners are compared, in seconds."""
 AT_ONCE, NEVER = 10**-0.5, 10**4.5
-"""Places on a logarithmic axis of a training that pays from the first target on, because the search
-never reaches the error, and of one that does not pay within 10^4 targets.
+"""Positions on a logarithmic axis for two results without a finite number of targets.
+
+`AT_ONCE`: training pays from the first target, because the search tuner never reaches the error.
+`NEVER`: training does not pay within 10^4 targets.
 """
 SECONDS_COLUMNS = ["range", "tuner", "simulation_seconds", "seconds"]
 SHARED = 100
-"""Targets that share one training where it is asked who wins at which cost."""
+"""Number of targets that share one training when tuners are compared by time."""
 
 
 @dataclass(frozen=True)
 class Price:
-    """What one tuner costs for one threshold.
+    """Cost of one tuner to reach one threshold.
 
     Attributes:
-        effort: on each target.
-        fit_simulations: of one training.
-        fit_seconds: of one training, simulations included.
-        simulation_seconds: of one simulation as it was made here.
+        effort: simulations and seconds spent on each target.
+        fit_simulations: number of simulations of one training.
+        fit_seconds: duration of one training including its simulations, in seconds.
+        simulation_seconds: duration of one simulation as measured in these runs, in seconds.
     """
 
     effort: Effort
@@ -62,10 +64,16 @@ class Price:
     simulation_seconds: float = 0.0
 
     def seconds(self, cost: Array, targets: float) -> Array:
-        """Seconds a target at `cost` seconds a simulation, where the training is shared by so many
-        targets.
+        """Compute the seconds per target for a given duration of one simulation.
+
+        Args:
+            cost: duration of one simulation in seconds, any shape.
+            targets: number of targets that share the cost of one training.
+
+        Returns:
+            Seconds per target, in the shape of `cost`.
         """
-        # Of its training, what the simulations took here is replaced by what they cost there.
+        # The measured time of the training simulations is replaced by their time at the given cost.
         learning = max(self.fit_seconds - self.fit_simulations * self.simulation_seconds, 0.0)
         marginal = self.effort.ert() * cost + self.effort.tuner_seconds()
         result: Array = marginal + (self.fit_simulations * cost + learning) / targets
@@ -80,15 +88,18 @@ def prices(
     simulator_seconds: Array,
     fits: Mapping[str, tuple[float, float]],
 ) -> dict[str, Price]:
-    """The price of every tuner in one experiment and range.
+    """Compute the cost of every tuner in one experiment and range.
 
     Args:
-        curves: of all its tuners.
-        threshold: of the metric.
-        budget: simulations on one target.
-        tuner_seconds: (R, K + 1) spent in the tuner so far.
-        simulator_seconds: likewise in the simulator.
+        curves: error curves of all tuners.
+        threshold: error threshold of the metric.
+        budget: number of simulations on one target.
+        tuner_seconds: (R, K + 1) cumulative seconds spent in the tuner after k simulations.
+        simulator_seconds: (R, K + 1) cumulative seconds spent in the simulator after k simulations.
         fits: (simulations, seconds) of one training, by tuner.
+
+    Returns:
+        Cost by tuner.
     """
     result = {}
     for tuner in curves.tuners():
@@ -100,13 +111,23 @@ def prices(
 
 
 def break_even(learned: Price, search: Price, picked: NDArray[np.int64] | None = None) -> Array:
-    """Targets n at which fit + n ert_learned = n ert_search: from there on training pays.
+    """Compute the number of targets from which training pays.
 
-    0 where the search never reaches the threshold, infinite where training never pays.
+    This is the n that solves fit + n ert_learned = n ert_search, with the expected running times
+    (ERT) of both tuners.
+
+    Args:
+        learned: cost of the learned tuner.
+        search: cost of the search tuner.
+        picked: (..., n) indices of the targets that are used; None for all targets.
+
+    Returns:
+        Number of targets; 0 where the search tuner never reaches the threshold, infinite where
+        training never pays.
     """
     # Solved for n: fit / (ert_search - ert_learned).
     hopeless = np.isinf(learned.effort.ert(picked))
-    # Where neither gets there, or they need the same, there is no number.
+    # The difference is NaN or not positive if both tuners fail or need the same number.
     with np.errstate(invalid="ignore", divide="ignore"):
         saved = search.effort.ert(picked) - learned.effort.ert(picked)
         result: Array = np.where(hopeless | ~(saved > 0), np.inf, learned.fit_simulations / saved)
@@ -116,13 +137,22 @@ def break_even(learned: Price, search: Price, picked: NDArray[np.int64] | None =
 def break_even_table(
     experiment: str, kind: str, threshold: float, held: Mapping[str, Price]
 ) -> pd.DataFrame:
-    """Every learned tuner against every search tuner, with 95 % bootstrap intervals over targets,
-    `EVEN_COLUMNS`.
+    """Compare every learned tuner with every search tuner by break-even targets.
+
+    Args:
+        experiment: name of the experiment.
+        kind: range of the targets.
+        threshold: error threshold of the metric.
+        held: cost by tuner.
+
+    Returns:
+        One row per pair with 95 % bootstrap intervals over targets, columns `EVEN_COLUMNS`.
     """
     lines = []
     for name, learned in held.items():
         for other, search in held.items():
-            # Only one that was trained can have paid for it, and only against one that was not.
+            # Only a trained tuner has a training cost, and it is compared with untrained tuners
+            # alone.
             if not learned.fit_simulations or search.fit_simulations:
                 continue
             picked = resampled(len(learned.effort.successes), experiment, kind)
@@ -135,8 +165,15 @@ def break_even_table(
 
 
 def winners(held: Mapping[str, Price], targets: float) -> list[tuple[float, float, str]]:
-    """(from, to, tuner): ranges of the cost of a simulation in seconds, and who needs the least
-    time there.
+    """Find the fastest tuner for each duration of one simulation.
+
+    Args:
+        held: cost by tuner.
+        targets: number of targets that share the cost of one training.
+
+    Returns:
+        List of (from, to, tuner): bounds of the duration of one simulation in seconds, and the
+        tuner that needs the least time between them. Empty if no tuner reaches the threshold.
     """
     names = [name for name, price in held.items() if np.isfinite(price.effort.ert())]
     if not names:
@@ -151,17 +188,21 @@ def winners(held: Mapping[str, Price], targets: float) -> list[tuple[float, floa
 
 
 def seconds_table(prices: Mapping[str, Mapping[str, Price]]) -> pd.DataFrame:
-    """Seconds for a target by the cost of a simulation, `SECONDS_COLUMNS`; nothing of who never
-    reaches the error.
+    """Build a table of seconds per target against the duration of one simulation.
+
+    Tuners that never reach the error have no rows.
 
     Args:
-        prices: of reaching one error, by range, by tuner.
+        prices: cost to reach one error, by range, by tuner.
+
+    Returns:
+        Table with the columns `SECONDS_COLUMNS`.
     """
     parts = []
     for kind, by_tuner in prices.items():
         for tuner, price in by_tuner.items():
             seconds = price.seconds(COSTS, SHARED)
-            # A logarithmic axis has no place for who is there from the start.
+            # A logarithmic axis cannot show a tuner that needs 0 seconds.
             if np.isfinite(price.effort.ert()) and seconds[0] > 0:
                 columns = (kind, tuner, COSTS, seconds)
                 parts.append(pd.DataFrame(dict(zip(SECONDS_COLUMNS, columns, strict=True))))
@@ -169,13 +210,11 @@ def seconds_table(prices: Mapping[str, Mapping[str, Price]]) -> pd.DataFrame:
 
 
 def placed_even(table: pd.DataFrame) -> pd.DataFrame:
-    """Put the numbers of targets of `break_even_table` on a logarithmic axis from `AT_ONCE` to
-    `NEVER`.
-    """
+    """Map target counts of `break_even_table` to a logarithmic axis from `AT_ONCE` to `NEVER`."""
     placed = table.copy()
     for column in ("targets", "low", "high"):
         values = table[column].to_numpy(dtype=np.float64)
-        # Fewer than one target is the first; what is beyond the axis stands at its end.
+        # Counts below one become one; counts beyond the axis are put at its end.
         within = np.where(values < 1e4, np.maximum(values, 1.0), NEVER)
         placed[column] = np.where(values == 0, AT_ONCE, within)
     return placed

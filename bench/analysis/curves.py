@@ -1,5 +1,6 @@
-"""Runs as one matrix: a row a run, a column for each number of simulations; what all statistics
-start from.
+"""Results of all runs as matrices, with a row per run and a column per number of simulations.
+
+All statistics of a comparison start from these matrices.
 """
 
 from __future__ import annotations
@@ -19,14 +20,13 @@ from sims.base import Array
 
 @dataclass(frozen=True)
 class Curves:
-    """One metric of all runs.
+    """Values of one metric for all runs.
 
     Attributes:
-        keys: a row a run: run, experiment, tuner, range, target, seed.
-        values: (R, K + 1) the metric after k simulations; a run that ended early keeps its last
-            value.
-        used: (R,) simulations that each run made.
-        failed: (R,) whether it crashed, timed out or diverged.
+        keys: one row per run with the columns run, experiment, tuner, range, target and seed.
+        values: (R, K + 1) metric after k simulations; a run that ended early keeps its last value.
+        used: (R,) number of simulations of each run.
+        failed: (R,) True for a run that crashed, timed out or diverged.
     """
 
     keys: pd.DataFrame
@@ -35,7 +35,7 @@ class Curves:
     failed: NDArray[np.bool_]
 
     def where(self, mask: NDArray[np.bool_]) -> Curves:
-        """The runs for which `mask` (R,) holds."""
+        """Return the runs selected by a boolean mask (R,)."""
         return Curves(
             self.keys[mask].reset_index(drop=True),
             self.values[mask],
@@ -44,54 +44,60 @@ class Curves:
         )
 
     def of(self, **values: str) -> Curves:
-        """The runs whose keys have these values."""
+        """Return the runs whose key columns have the given values."""
         mask = np.ones(len(self.keys), dtype=bool)
         for name, value in values.items():
             mask &= (self.keys[name] == value).to_numpy(dtype=bool)
         return self.where(mask)
 
     def tuners(self) -> list[str]:
-        """Labels in the order in which they first come."""
+        """Return the tuner labels in the order of their first run."""
         return [str(t) for t in dict.fromkeys(self.keys["tuner"])]
 
     def by_target(self) -> tuple[list[str], list[NDArray[np.int64]]]:
-        """Names of the targets, sorted, and the rows of each."""
+        """Group the runs by target.
+
+        Returns:
+            Sorted names of the targets, and the row indices of each target.
+        """
         codes, names = pd.factorize(self.keys["target"], sort=True)
         ends = np.cumsum(np.bincount(codes, minlength=len(names)))
         groups = np.split(np.argsort(codes, kind="stable"), ends[:-1])
         return [str(n) for n in names], groups[: len(names)]
 
     def after(self, k: int) -> Array:
-        """(R,) the metric after k simulations; infinite for a run that failed, now or later: what
-        it recommended cannot be trusted.
+        """Return the metric after k simulations, shape (R,).
+
+        A failed run has an infinite value at every k, because its recommendations cannot be
+        trusted.
         """
         values = self.values[:, k]
         return np.where(self.failed | np.isnan(values), np.inf, values)
 
     def final(self) -> Array:
-        """(R,) the metric after all simulations, see `after`."""
+        """Return the metric after all simulations, shape (R,); see `after`."""
         return self.after(-1)
 
 
 KEYS = ["run", "experiment", "tuner", "range", "target", "seed"]
-"""Columns that are the same in every row of a run."""
+"""Columns that are equal in all rows of one run."""
 
 
 class Rows:
-    """Rows of runs.parquet, laid out once for every metric that is asked for.
+    """Table of runs.parquet, arranged once so that a matrix of any column can be built from it.
 
     Args:
-        runs: at least `KEYS`, k and the metrics.
+        runs: rows with at least the columns `KEYS`, k and the metrics.
         statuses: rows of status.csv.
-        budget: largest number of simulations of interest.
+        budget: largest number of simulations that is used.
     """
 
     def __init__(self, runs: pd.DataFrame, statuses: pd.DataFrame, budget: int) -> None:
         self._runs, self._budget = runs, budget
-        # Every metric fills a matrix by the same places: they are worked out once.
+        # The matrices of all metrics use the same row and column indices.
         codes, names = pd.factorize(runs["run"])
         self._codes, self._k = codes, runs["k"].to_numpy(dtype=np.int64)
-        # Written from behind, so that what stays is the place of each run's first row.
+        # The assignment runs in reverse order, so that the first row of each run remains.
         first = np.zeros(len(names), dtype=np.int64)
         first[codes[::-1]] = np.arange(len(codes))[::-1]
         self.keys = runs[[k for k in KEYS if k in runs]].iloc[first].reset_index(drop=True)
@@ -101,7 +107,11 @@ class Rows:
         self.failed = self.keys["run"].isin(bad).to_numpy(dtype=bool)
 
     def matrix(self, name: str) -> Array:
-        """(R, budget + 1) a column of the rows, run by run; NaN behind the end of a run."""
+        """Arrange a column as a matrix of runs and numbers of simulations.
+
+        Returns:
+            (R, budget + 1) values; NaN after the end of a run.
+        """
         values = np.full((len(self.keys), self._budget + 1), np.nan)
         within = self._k <= self._budget
         column = self._runs[name].to_numpy(dtype=np.float64)
@@ -109,9 +119,9 @@ class Rows:
         return values
 
     def curves(self, metric: str) -> Curves:
-        """A metric after k simulations; a run that ended early keeps its last value."""
+        """Build the curves of a metric; a run that ended early keeps its last value."""
         values = self.matrix(metric)
-        # Behind its end a run stands by its last recommendation.
+        # After the end of a run, its last recommendation is used.
         last = np.minimum(self.used, self._budget)[:, None]
         columns = np.minimum(np.arange(self._budget + 1)[None], last)
         return Curves(
@@ -119,20 +129,30 @@ class Rows:
         )
 
     def spent(self, name: str) -> Array:
-        """(R, budget + 1) a column of seconds, added up over the simulations so far."""
+        """Compute the cumulative seconds of a column.
+
+        Returns:
+            (R, budget + 1) seconds summed over the simulations so far.
+        """
         return np.nancumsum(self.matrix(name), axis=1)
 
 
 def mean_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Array:
-    """(targets, ...) the mean of each target's rows of `values` (R, ...), without those that are
-    NaN.
+    """Compute the mean of each target's rows, ignoring NaN.
+
+    Args:
+        values: (R, ...) one row per run.
+        groups: row indices of each target.
+
+    Returns:
+        (targets, ...) means; NaN where all values of a target are NaN.
     """
     result = np.empty((len(groups), *values.shape[1:]))
     counts = np.array([len(rows) for rows in groups])
     with warnings.catch_warnings():
-        # Nothing but NaN has no mean: NaN.
+        # NumPy warns about the mean of NaN alone; the result NaN is intended.
         warnings.simplefilter("ignore", RuntimeWarning)
-        # Targets with as many seeds are laid side by side.
+        # Targets with the same number of seeds are averaged in one array operation.
         for count in np.unique(counts):
             places = np.flatnonzero(counts == count).tolist()
             rows = np.array([groups[place] for place in places])
@@ -141,8 +161,12 @@ def mean_over_seeds(values: Array, groups: Sequence[NDArray[np.int64]]) -> Array
 
 
 class Decisive(NamedTuple):
-    """What decides a comparison: a metric, the runs that have it, and whether it counts in training
-    widths.
+    """Metric that decides a comparison.
+
+    Attributes:
+        metric: column name of the metric.
+        runs: runs that have a value of the metric.
+        in_widths: True if the metric is measured in widths of the training range.
     """
 
     metric: str
@@ -151,11 +175,11 @@ class Decisive(NamedTuple):
 
 
 def primary(runs: pd.DataFrame) -> Decisive:
-    """The metric that decides: the parameters' error where the truth is known, else the error on
-    held-out runs.
+    """Select the metric that decides a comparison.
 
-    Where some target's data leave a direction sloppy, it is the error along stiff directions:
-    nobody could know the others. A target without a stiff direction then decides nothing.
+    It is the parameter error if the true parameters are known, otherwise the error on held-out
+    runs. If some target has sloppy directions, it is the error along stiff directions, because the
+    data do not determine the others. A target without a stiff direction is then left out.
     """
     sloppy = "sloppy_error" in runs and runs["sloppy_error"].notna().any()
     if sloppy and runs["stiff_error"].notna().any():

@@ -1,6 +1,4 @@
-"""What every table says of how its runs were made: whether tuners were trusted, and whether
-everybody could draw the targets.
-"""
+"""Columns of result tables that describe how the runs were made."""
 
 from __future__ import annotations
 
@@ -10,12 +8,10 @@ from bench.problem.experiment import Experiment
 
 
 def marked(frame: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
-    """The table with a column that says whether the tuners were trusted."""
+    """Add the column `trusted`, True if the tuners ran without isolation."""
     return frame.assign(trusted=experiment.trusted)
 
 
 def with_salt(frame: pd.DataFrame, experiment: Experiment) -> pd.DataFrame:
-    """The table with a column that says what its targets were drawn from: ``secret`` until all was
-    done, or ``public``.
-    """
+    """Add the column `salt`: ``secret`` if the salt is committed by a hash, else ``public``."""
     return frame.assign(salt="secret" if experiment.salt_sha256 else "public")

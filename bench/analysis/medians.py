@@ -1,5 +1,7 @@
-"""Medians over targets with 95 % percentile-bootstrap intervals: against simulations, and against
-the target's distance from the training range. The figures draw them, and the page holds them.
+"""Medians over targets with 95 % percentile-bootstrap intervals, for figures and the report.
+
+Errors are given against the number of simulations and against the target's distance from the
+training range.
 """
 
 from __future__ import annotations
@@ -30,34 +32,44 @@ DISTANCE_COLUMNS = [
 _MOST_GROUPS = 4
 """Maximum number of groups of targets outside the training range."""
 _GROUP = 4
-"""Minimum number of targets in a group outside the training range, if there are that many targets:
-the interval of a smaller group says little.
+"""Minimum number of targets in a group outside the training range.
+
+A group can be smaller if there are fewer targets in total. The interval of a smaller group would
+say little.
 """
 _RESAMPLES = 500
-"""Of the bootstrap: enough for a band a few pixels wide."""
+"""Number of bootstrap resamples; enough for an interval band a few pixels wide."""
 _POINTS = 40
-"""Numbers of simulations of a curve, on a logarithmic scale."""
+"""Number of points of a curve, on a logarithmic scale of simulations."""
 _SAME = 0.02
-"""Relative difference of errors that a logarithmic axis does not show."""
+"""Relative difference of errors that is not visible on a logarithmic axis."""
 _MOMENTS = (3, 10)
-"""Numbers of simulations at which errors are put against distance, beside the whole budget."""
+"""Numbers of simulations for plots of error against distance, in addition to the whole budget."""
 
 
 def drawn(budget: int) -> list[int]:
-    """Numbers of simulations at which a curve has points: those of the tables, and some between."""
+    """Return the numbers of simulations of a curve's points, including those of the tables."""
     between = np.unique(np.geomspace(1, budget, _POINTS).astype(int))
     return sorted({*checkpoints(budget), *between.tolist()})
 
 
 def moments(budget: int) -> list[int]:
-    """Numbers of simulations at which errors are put against distance."""
+    """Return the numbers of simulations at which errors are plotted against distance."""
     return [k for k in _MOMENTS if k < budget] + [budget]
 
 
 def median_curves(curves: Curves, metric: str, budget: int) -> pd.DataFrame:
-    """Each tuner's median of a metric over targets against simulations, `MEDIAN_COLUMNS`.
+    """Compute each tuner's median of a metric over targets, by number of simulations.
 
-    A target's value is the mean over its seeds. A tuner all of whose runs failed has no rows.
+    A target's value is the mean over its seeds. A tuner has no rows if all its runs failed.
+
+    Args:
+        curves: values of the metric.
+        metric: name of the metric, for the random stream of the bootstrap.
+        budget: largest number of simulations.
+
+    Returns:
+        Table with the columns `MEDIAN_COLUMNS`.
     """
     points = drawn(budget)
     parts = []
@@ -76,15 +88,15 @@ def median_curves(curves: Curves, metric: str, budget: int) -> pd.DataFrame:
 def coinciding(drawn: Mapping[str, Sequence[pd.Series[float]]]) -> dict[str, str]:
     """Find curves that cannot be seen because another one is drawn above them.
 
-    A curve coincides with a later one up to k where the two differ by less than `_SAME` in every
-    panel up to k, and have halved the error of the start by then: until then most tuners are alike.
+    A curve coincides with a later one up to k if the two differ by less than `_SAME` in every panel
+    up to k, and if they have halved the initial error by then. Before that most tuners are equal.
 
     Args:
-        drawn: by tuner, in the order in which curves are drawn, its curve in each panel: medians by
-            number of simulations.
+        drawn: curves of each tuner in drawing order, one per panel: medians by number of
+            simulations.
 
     Returns:
-        By tuner whose curve is covered: ``same as hybrid up to 2``, or ``same as hybrid``.
+        Note by tuner whose curve is covered: ``same as hybrid up to 2``, or ``same as hybrid``.
     """
     notes = {}
     names = list(drawn)
@@ -104,7 +116,7 @@ def coinciding(drawn: Mapping[str, Sequence[pd.Series[float]]]) -> dict[str, str
 
 
 def _equal_up_to(mine: pd.Series[float], other: pd.Series[float]) -> int:
-    """The largest number of simulations up to which two curves look the same; 0 for none."""
+    """Return the largest number of simulations up to which two curves look the same; 0 for none."""
     points = mine.index.intersection(other.index)
     a, b = mine[points].to_numpy(), other[points].to_numpy()
     same = np.logical_and.accumulate(np.abs(a - b) <= _SAME * np.maximum(a, b))
@@ -112,19 +124,19 @@ def _equal_up_to(mine: pd.Series[float], other: pd.Series[float]) -> int:
 
 
 def by_distance(curves: Curves, distances: pd.Series[float], budget: int) -> pd.DataFrame:
-    """Median error after few, some and all simulations by distance from the training range.
+    """Compute median errors by distance from the training range, after few and all simulations.
 
     Targets inside the training range are one group (bin 0). Those outside are sorted by distance
     and divided into at most `_MOST_GROUPS` groups of equal size.
 
     Args:
-        curves: of the error, in the range `wide`.
-        distances: of each target from the training range, by its name.
+        curves: error of the runs in the range `wide`.
+        distances: distance of each target from the training range, by target name.
         budget: largest number of simulations.
 
     Returns:
-        A row for each number of simulations, tuner and group, columns `DISTANCE_COLUMNS`; `beyond`
-        and `to` are the smallest and largest distance in the group.
+        One row per number of simulations, tuner and group, columns `DISTANCE_COLUMNS`; `beyond` and
+        `to` are the smallest and largest distance in the group.
     """
     groups = _groups(distances)
     points = moments(budget)
@@ -146,7 +158,7 @@ def _values(frame: pd.DataFrame) -> Array:
 
 
 def _groups(distances: pd.Series[float]) -> dict[int, list[str]]:
-    """Names of the targets of each group: 0 inside the training range, then by distance."""
+    """Return the target names of each group: 0 inside the training range, then by distance."""
     inside = list(distances.index[distances <= 0])
     outside = list(distances[distances > 0].sort_values(kind="stable").index)
     count = min(max(len(outside) // _GROUP, 1), _MOST_GROUPS)
@@ -155,15 +167,15 @@ def _groups(distances: pd.Series[float]) -> dict[int, list[str]]:
 
 
 def _middle(values: Array, tuner: str, place: int) -> tuple[float, float, float]:
-    """Median of (n,) values with its interval; NaN for that of a single one."""
-    # The stream's name counts targets inside as the bin before the first.
+    """Return the median of values (n,) with its interval; the interval of one value is NaN."""
+    # The stream's name numbers the group inside the training range -1.
     names = ("distance", tuner, str(place - 1))
     low, high = interval(values[:, None], medians, *names, resamples=_RESAMPLES)
     return float(np.median(values)), float(low[0]), float(high[0])
 
 
 def bin_names(table: pd.DataFrame) -> list[str]:
-    """Return what the groups of `by_distance` are called, with their numbers of targets."""
+    """Return the labels of the groups of `by_distance`, with their numbers of targets."""
     first = {int(row["bin"]): row for row in table.drop_duplicates("bin").to_dict("records")}
     names = []
     for b in range(max(first, default=0) + 1):

@@ -1,4 +1,4 @@
-"""Tuner against tuner: paired tests over targets with effect sizes, and mean ranks over problems.
+"""Paired tests of tuners over targets with effect sizes, and mean ranks over problems.
 
 Sources: F. Wilcoxon, Biometrics Bulletin 1(6), 1945 (scipy); S. Holm, Scand. J. Statist. 6, 65,
 1979; D. S. Kerby, Comprehensive Psychology 3, 2014, for the matched-pairs rank-biserial
@@ -31,25 +31,26 @@ PAIR_COLUMNS = [
     "p_holm",
 ]
 LEAST = 1e-12
-"""Errors below this count as equal: rounding."""
+"""Errors below this value count as equal, because they consist of rounding."""
 _WORST = 1e3
-"""Logarithm that stands for a target on which a run failed: worse than any error, and as bad as
-another failure.
-"""
+"""Logarithm that represents a failed run: larger than any error, and equal for all failures."""
 PROBLEMS = 5
-"""Problems that mean ranks need at least."""
+"""Minimum number of problems for mean ranks."""
 
 
 def log_errors(curves: Curves, k: int = -1, floor: float = LEAST) -> pd.DataFrame:
-    """Logarithms of errors after k simulations, a row a target, a column a tuner.
+    """Compute the logarithms of errors after k simulations.
 
-    The mean over seeds is taken first. A failure in one seed makes it infinite: the tuner then
-    counts as failed on this target.
+    The mean over seeds is taken first. A failure in one seed makes it infinite, so the tuner counts
+    as failed on this target.
 
     Args:
-        curves: the error of every run.
+        curves: error of every run.
         k: number of simulations; -1 for all.
-        floor: errors below this count as equal to it.
+        floor: errors below this value count as equal to it.
+
+    Returns:
+        Table with one row per target and one column per tuner.
     """
     columns = {}
     for tuner in curves.tuners():
@@ -63,14 +64,15 @@ def log_errors(curves: Curves, k: int = -1, floor: float = LEAST) -> pd.DataFram
 def pairs(curves: Curves, floor: float = LEAST) -> pd.DataFrame:
     """Compare every pair of tuners on the targets of each experiment and range.
 
-    Columns are `PAIR_COLUMNS`. `a_better` is the share of targets on which a ends with the smaller
-    error (ties count half); `effect` the rank-biserial correlation, 1 where a is better on all
-    targets, -1 where b is; `error_ratio` the median of a's error over b's. Holm's correction is
-    over all pairs of an experiment and range.
-
     Args:
-        curves: the error of every run.
-        floor: errors below this count as equal to it.
+        curves: error of every run.
+        floor: errors below this value count as equal to it.
+
+    Returns:
+        Table with the columns `PAIR_COLUMNS`. `a_better` is the share of targets on which a ends
+        with the smaller error (ties count half). `effect` is the rank-biserial correlation, 1 if a
+        is better on all targets, -1 if b is. `error_ratio` is the median of a's error over b's.
+        Holm's correction is over all pairs of an experiment and range.
     """
     parts = []
     for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
@@ -88,8 +90,10 @@ def pairs(curves: Curves, floor: float = LEAST) -> pd.DataFrame:
 
 
 def holm(p: Array) -> Array:
-    """(n,) p-values p (n,) of one family, each corrected so that the chance of any false alarm
-    among them stays at the level: the k-th smallest times n + 1 - k, none below one before it.
+    """Apply the Holm correction to the p-values (n,) of one family of tests.
+
+    It bounds the probability of any false rejection in the family. The k-th smallest p-value is
+    multiplied by n + 1 - k; a corrected value is at least as large as the one before it.
     """
     order = np.argsort(p, kind="stable")
     steps = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
@@ -99,23 +103,27 @@ def holm(p: Array) -> Array:
 
 
 def logarithms(errors: Array, floor: float = LEAST) -> Array:
-    """Return logarithms of errors (n,), of which those below `floor` count as equal to it.
+    """Return logarithms of errors (n,); errors below `floor` count as equal to it.
 
-    An infinite error, as of a run that failed, becomes a number that is worse than any error.
+    An infinite error, as of a failed run, becomes a number that is larger than any error.
+
+    Args:
+        errors: (n,) errors.
+        floor: smallest error that is distinguished.
     """
     logs: Array = np.where(np.isinf(errors), _WORST, np.log(np.maximum(errors, floor)))
     return logs
 
 
 class PairedTest(NamedTuple):
-    """How tuner a does against tuner b on the same targets.
+    """Comparison of tuner a with tuner b on the same targets.
 
     Attributes:
-        targets: number of targets that both have.
-        a_better: share of them on which a has the smaller error; ties count half.
-        effect: matched-pairs rank-biserial correlation, 1 where a is better on all targets.
+        targets: number of targets that both tuners have.
+        a_better: share of targets on which a has the smaller error; ties count half.
+        effect: matched-pairs rank-biserial correlation, 1 if a is better on all targets.
         ratio: median over targets of a's error over b's.
-        p_value: of Wilcoxon's signed-rank test, two-sided.
+        p_value: two-sided p-value of Wilcoxon's signed-rank test.
     """
 
     targets: int
@@ -126,49 +134,64 @@ class PairedTest(NamedTuple):
 
 
 def compared(a: Array, b: Array) -> PairedTest:
-    """Compare the logarithms of errors a and b (n,) on the same targets."""
+    """Compare two tuners by Wilcoxon's signed-rank test.
+
+    Args:
+        a: (n,) logarithms of the errors of tuner a; NaN where it has none.
+        b: (n,) logarithms of the errors of tuner b on the same targets.
+    """
     from scipy.stats import rankdata, wilcoxon
 
     there = ~(np.isnan(a) | np.isnan(b))
     difference = a[there] - b[there]
     wins = (difference < 0) + 0.5 * (difference == 0)
     better = float(wins.mean()) if len(difference) else np.nan
-    # Wilcoxon drops ties: they speak for neither.
+    # Wilcoxon's test drops ties.
     unequal = difference[difference != 0]
     if not len(unequal):
         return PairedTest(len(difference), better, 0.0, 1.0, 1.0)
     ranks = rankdata(np.abs(unequal))
-    # Kerby's simple difference: the share of ranks in favour less the share against.
+    # Kerby's simple difference: the share of ranks in favour minus the share against.
     effect = float((ranks[unequal < 0].sum() - ranks[unequal > 0].sum()) / ranks.sum())
     with warnings.catch_warnings():
-        # Of few pairs or ties it says that it approximates.
+        # scipy warns that it approximates if there are few pairs or ties.
         warnings.simplefilter("ignore")
         p = float(wilcoxon(unequal).pvalue)
-    # A failure against none makes a ratio beyond what a number holds.
+    # The ratio of a failed run and a successful one would overflow.
     ratio = float(np.exp(np.clip(np.median(difference), -700, 700)))
     return PairedTest(len(difference), better, effect, ratio, p)
 
 
 def ranks(curves: Curves, floor: float = LEAST) -> pd.DataFrame:
-    """Rank each tuner (columns) on each problem (rows): by the median over targets, failures last,
-    1 is best. Errors below `floor` count as equal to it.
+    """Rank tuners on each problem by their median error over targets.
 
-    A problem is an experiment and a range; tuners that miss a problem are left out.
+    A problem is an experiment and a range. The best tuner has rank 1 and failures are last. Tuners
+    that miss a problem are left out.
+
+    Args:
+        curves: error of every run.
+        floor: errors below this value count as equal to it.
+
+    Returns:
+        Ranks with one row per problem and one column per tuner.
     """
     rows = {}
     for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
         logs = log_errors(curves.of(experiment=str(experiment), range=str(kind)), floor=floor)
         rows[f"{experiment} {kind}"] = logs.median(axis=0)
     medians = pd.DataFrame(rows).T.dropna(axis="columns")
-    # Rounded, so that errors that differ by the last bit share a rank.
+    # Rounding gives errors that differ by the last bit the same rank.
     return medians.round(9).rank(axis=1)
 
 
 def nemenyi(ranked: pd.DataFrame) -> tuple[float, pd.DataFrame]:
-    """Friedman's p-value, and Nemenyi's for each pair of tuners, of ranks (problems, tuners).
+    """Test ranks (problems, tuners) with Friedman's test and Nemenyi's post-hoc test.
+
+    Returns:
+        Friedman's p-value, and Nemenyi's p-value for each pair of tuners.
 
     Raises:
-        ValueError: fewer than `PROBLEMS` problems or three tuners, of which mean ranks say nothing.
+        ValueError: there are fewer than `PROBLEMS` problems or fewer than three tuners.
     """
     if len(ranked) < PROBLEMS or ranked.shape[1] < 3:
         raise ValueError(f"mean ranks need {PROBLEMS} problems and 3 tuners, found {ranked.shape}")

@@ -1,9 +1,9 @@
 """Percentile-bootstrap intervals over targets (Efron & Tibshirani 1993, ch. 13).
 
-A resample is told by how often it holds each target: a mean is then a weighted one, and a median is
-found by counting along the sorted values, once for all resamples. scipy's bootstrap lays every
-resample out instead, which for 825 targets and 48 columns takes twenty times as long; it gives the
-same numbers from the same draws, and the tests hold it beside this.
+A resample is represented by the number of times that it contains each target. A mean is then a
+weighted mean, and a median is found by counting along the sorted values, once for all resamples.
+scipy's bootstrap builds every resample as an array, which takes twenty times as long for 825
+targets and 48 columns. It gives the same numbers from the same draws; the tests compare both.
 """
 
 from __future__ import annotations
@@ -18,22 +18,27 @@ from bench.problem.seeds import rng_for
 from sims.base import Array
 
 Counts = NDArray[np.unsignedinteger[Any]]
-"""(n, resamples) how often each of n targets stands in each resample, in so few bits as hold n."""
+"""Number of times that each target is in each resample, shape (n, resamples).
+
+The smallest unsigned integer type that holds n is used.
+"""
 LEVEL = (0.025, 0.975)
-"""Quantiles between which 95 % lie."""
+"""Quantiles of the bootstrap distribution that bound a 95 % interval."""
 
 
 def interval(
     values: Array, statistic: Callable[[Array, Counts], Array], *names: str, resamples: int = 2000
 ) -> tuple[Array, Array]:
-    """95 % percentile-bootstrap interval of a statistic over rows of `values` (n, m); NaN for fewer
-    than two rows.
+    """Compute the 95 % percentile-bootstrap interval of a statistic over the rows of an array.
 
     Args:
-        values: what was measured, one row a target.
+        values: (n, m) measured values, one row per target; rows that are not finite are left out.
         statistic: `means` or `medians`.
-        names: what the resampling's random stream depends on.
+        names: names that determine the random stream of the bootstrap.
         resamples: number of resamples.
+
+    Returns:
+        Lower and upper bounds (m,); NaN if there are fewer than two rows.
     """
     values = values[np.isfinite(values).all(axis=1)]
     if len(values) < 2:
@@ -44,7 +49,16 @@ def interval(
 
 
 def drawn(n: int, resamples: int, rng: np.random.Generator) -> Counts:
-    """How often each of n targets is drawn where n are, with replacement."""
+    """Draw n targets with replacement, and count how often each one is drawn.
+
+    Args:
+        n: number of targets.
+        resamples: number of resamples.
+        rng: random generator.
+
+    Returns:
+        (n, resamples) counts.
+    """
     picked = rng.integers(n, size=(resamples, n))
     picked += n * np.arange(resamples)[:, None]
     counts = np.bincount(picked.ravel(), minlength=resamples * n)
@@ -52,22 +66,39 @@ def drawn(n: int, resamples: int, rng: np.random.Generator) -> Counts:
 
 
 def means(values: Array, counts: Counts) -> Array:
-    """(m, resamples) means over the rows of `values` (n, m)."""
+    """Compute means of resampled rows.
+
+    Args:
+        values: (n, m) one row per target.
+        counts: (n, resamples) number of times that each row is in each resample.
+
+    Returns:
+        (m, resamples) means.
+    """
     total = np.zeros((values.shape[1], counts.shape[1]))
-    # Row after row: a product of matrices adds up in an order that depends on the machine.
+    # Rows are added one by one: the summation order of a matrix product depends on the machine.
     for row, often in zip(values, counts, strict=True):
         total += row[:, None] * often
     return total / len(values)
 
 
 def medians(values: Array, counts: Counts) -> Array:
-    """(m, resamples) medians over the rows of `values` (n, m)."""
+    """Compute medians of resampled rows.
+
+    Args:
+        values: (n, m) one row per target.
+        counts: (n, resamples) number of times that each row is in each resample.
+
+    Returns:
+        (m, resamples) medians.
+    """
     n = len(values)
     result = np.empty((values.shape[1], counts.shape[1]))
     for column, place in zip(values.T, result, strict=True):
         order = np.argsort(column)
         upto = np.cumsum(counts[order], axis=0, dtype=counts.dtype)
-        # The k-th smallest of a resample, from 0, is the first with more than k up to it.
+        # With k counted from 0, the k-th smallest value of a resample is the first sorted value
+        # whose cumulative count is larger than k.
         lower, upper = (
             np.add.reduce(upto <= k, axis=0, dtype=counts.dtype) for k in ((n - 1) // 2, n // 2)
         )

@@ -1,4 +1,4 @@
-"""Where errors end."""
+"""Smallest error that results distinguish."""
 
 FLOOR = 1e-9
-"""Errors below this count as this: less than rounding in the observation."""
+"""Errors below this value count as equal to it; they are smaller than rounding in observations."""

@@ -1,12 +1,13 @@
-"""Expected running time and runtime distributions over error thresholds, as in COCO.
+"""Expected running time (ERT) and runtime distributions over error thresholds, as in COCO.
 
-Source: N. Hansen, A. Auger, D. Brockhoff, T. Tusar, Anytime performance assessment in blackbox
+Sources: N. Hansen, A. Auger, D. Brockhoff, T. Tusar, Anytime performance assessment in blackbox
 optimization benchmarking, IEEE TEVC 26(6), 2022, sections III and IV; N. Hansen, A. Auger, R. Ros,
-S. Finck, P. Posik, Comparing results of 31 algorithms from BBOB-2009, GECCO 2010, for ERT. Two
-things differ on purpose. A run has reached a
-threshold after the simulation from which on what it would deliver *stays* within it: the first
-touch is known to nobody who has no truth. And a failed run has reached nothing and counts with its
-whole budget.
+S. Finck, P. Posik, Comparing results of 31 algorithms from BBOB-2009, GECCO 2010, for ERT.
+
+Two definitions differ on purpose. A run has reached a threshold after the simulation from which on
+its recommendation *stays* within the threshold, because a user without the true parameters cannot
+know when an error is below it for the first time. A failed run has reached no threshold, and counts
+with its whole budget.
 """
 
 from __future__ import annotations
@@ -23,35 +24,47 @@ from bench.problem.seeds import rng_for
 from sims.base import Array
 
 THRESHOLDS: Array = np.logspace(0, -8, 51)
-"""Of the runtime distribution, in training widths; as many as COCO's."""
+"""Thresholds of the runtime distribution in widths of the training range; 51 as in COCO."""
 LEVELS = (0.1, 0.01, 1e-3, 1e-4, 1e-6)
-"""Of the ERT table, in training widths."""
+"""Thresholds of the ERT table in widths of the training range."""
 
 
 def thresholds(curves: Curves, simulated: bool) -> tuple[Array, tuple[float, ...]]:
-    """Thresholds of the distribution and levels of the table.
+    """Choose thresholds of the runtime distribution and of the ERT table.
 
-    On a recording they lie between the median error of the starts and the least that anyone ended
-    with.
+    For a recording, they are between the median initial error and the smallest final error.
+
+    Args:
+        curves: values of the deciding metric.
+        simulated: True if errors are in widths of the training range.
+
+    Returns:
+        Thresholds of the distribution, and thresholds of the table.
     """
     if simulated:
         return THRESHOLDS, LEVELS
     start = float(np.nanmedian(curves.values[:, 0]))
-    # At least half the way: where nobody improved, thresholds must differ all the same.
+    # At most half of the initial error, so that thresholds differ even if no tuner improved.
     best = min(float(np.nanmin(curves.final())), 0.5 * start)
-    # A little above the best, so that rounding does not keep the best from reaching it.
+    # Slightly above the smallest error, so that the best run reaches it despite rounding.
     spread = np.geomspace(start, 1.001 * best, 21)
     return spread, tuple(float(x) for x in spread[[5, 10, 15, 18, 20]])
 
 
 def reached(curves: Curves, threshold: float) -> Array:
-    """(R,) simulations after which the error stays at or below `threshold`; infinite where it never
-    does.
+    """Compute the number of simulations after which the error stays at or below a threshold.
+
+    Args:
+        curves: values of the metric.
+        threshold: error threshold.
+
+    Returns:
+        (R,) numbers of simulations; infinite for runs that do not reach the threshold.
     """
-    # Negated, so that a NaN is beyond.
+    # The comparison is negated, so that NaN counts as above the threshold.
     beyond = ~(curves.values <= threshold)
     steps = beyond.shape[1]
-    # One behind the last that is beyond: from there on the error stays.
+    # The first index after the last value above the threshold.
     last = steps - np.argmax(beyond[:, ::-1], axis=1)
     last = np.where(beyond.any(axis=1), last, 0)
     return np.where((last >= steps) | curves.failed, np.inf, last.astype(np.float64))
@@ -59,13 +72,13 @@ def reached(curves: Curves, threshold: float) -> Array:
 
 @dataclass(frozen=True)
 class Effort:
-    """What reaching a threshold took, by target.
+    """Effort to reach a threshold, by target.
 
     Attributes:
-        simulations: (targets,) spent in all runs of a target, until the threshold or the end.
-        seconds: (targets,) of the tuner, likewise.
-        successes: (targets,) runs that reached it.
-        runs: all runs.
+        simulations: (targets,) simulations of all runs of a target, until the threshold or the end.
+        seconds: (targets,) seconds in the tuner, until the threshold or the end.
+        successes: (targets,) number of runs that reached the threshold.
+        runs: number of all runs.
     """
 
     simulations: Array
@@ -74,13 +87,18 @@ class Effort:
     runs: int
 
     def ert(self, picked: NDArray[np.int64] | None = None) -> Array:
-        """Simulations spent for each success, over the targets `picked` (..., n); infinite without
-        a success.
+        """Compute the expected running time: simulations per success.
+
+        Args:
+            picked: (..., n) indices of the targets that are used; None for all targets.
+
+        Returns:
+            (...) expected running time; infinite without a success.
         """
         return _per_success(self.simulations, self.successes, picked)
 
     def tuner_seconds(self) -> float:
-        """Seconds in the tuner for each success."""
+        """Return the seconds in the tuner per success."""
         return float(_per_success(self.seconds, self.successes, None))
 
 
@@ -97,13 +115,13 @@ def _per_success(
 def effort(
     curves: Curves, threshold: float, budget: int, tuner_seconds: Array | None = None
 ) -> Effort:
-    """What it took the runs of one tuner to reach `threshold`.
+    """Compute the effort of one tuner's runs to reach a threshold.
 
     Args:
-        curves: of one tuner and range.
-        threshold: of the metric.
-        budget: what a failed run counts with.
-        tuner_seconds: (R, K + 1) spent in the tuner so far.
+        curves: curves of one tuner and range.
+        threshold: threshold of the metric.
+        budget: number of simulations that a failed run counts with.
+        tuner_seconds: (R, K + 1) cumulative seconds in the tuner; None if they are not needed.
     """
     times = reached(curves, threshold)
     success = np.isfinite(times)
@@ -111,7 +129,7 @@ def effort(
     spent = np.where(success, times, unsuccessful)
     seconds = np.zeros(len(spent))
     if tuner_seconds is not None:
-        # A run that went beyond the budget of interest counts with its seconds there.
+        # A run that exceeded the budget counts with its seconds at the budget.
         column = np.minimum(spent, tuner_seconds.shape[1] - 1).astype(np.int64)
         seconds = tuner_seconds[np.arange(len(spent)), column]
     _, groups = curves.by_target()
@@ -124,15 +142,24 @@ def effort(
 
 
 def resampled(targets: int, *names: str, resamples: int = 1000) -> NDArray[np.int64]:
-    """(resamples, targets) places of targets drawn with replacement; the same for tuners that share
-    the targets.
+    """Draw target indices with replacement, from a random stream that depends on names only.
+
+    Tuners that share the targets get the same draws.
+
+    Args:
+        targets: number of targets.
+        names: names that determine the random stream.
+        resamples: number of resamples.
+
+    Returns:
+        (resamples, targets) indices.
     """
     return rng_for("resample", *names).integers(targets, size=(resamples, targets))
 
 
 def percentile_interval(values: Array) -> tuple[float, float]:
-    """95 % percentile interval of resampled values, which may be infinite."""
-    # Order statistics, no interpolation: between a number and infinity lies nothing.
+    """Return the 95 % percentile interval of resampled values, which may be infinite."""
+    # Order statistics are used without interpolation, because values may be infinite.
     ordered = np.sort(values)
     n = len(ordered)
     return float(ordered[int(0.025 * (n - 1))]), float(ordered[int(np.ceil(0.975 * (n - 1)))])
@@ -153,7 +180,16 @@ ERT_COLUMNS = [
 
 
 def ert_table(curves: Curves, levels: tuple[float, ...], budget: int) -> pd.DataFrame:
-    """ERT with its 95 % bootstrap interval over targets, columns as `ERT_COLUMNS`."""
+    """Compute the expected running time of each tuner with 95 % bootstrap intervals.
+
+    Args:
+        curves: values of the deciding metric.
+        levels: error thresholds.
+        budget: largest number of simulations.
+
+    Returns:
+        Table with the columns `ERT_COLUMNS`; the intervals are over targets.
+    """
     lines = []
     for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
         part = curves.of(experiment=str(experiment), range=str(kind))
@@ -161,7 +197,8 @@ def ert_table(curves: Curves, levels: tuple[float, ...], budget: int) -> pd.Data
             mine = part.of(tuner=tuner)
             for level in levels:
                 spent = effort(mine, level, budget)
-                # The same draws for every tuner: what they share does not blur a comparison.
+                # All tuners use the same draws, so that differences between targets cancel in
+                # comparisons.
                 picked = resampled(len(spent.successes), str(experiment), str(kind))
                 low, high = percentile_interval(spent.ert(picked))
                 counts = int(spent.successes.sum()), spent.runs, int(mine.failed.sum())
@@ -173,22 +210,35 @@ def ert_table(curves: Curves, levels: tuple[float, ...], budget: int) -> pd.Data
 
 SHARE_COLUMNS = ["range", "tuner", "simulations", "share"]
 _POINTS = 60
-"""Numbers of simulations of a runtime distribution, on a logarithmic scale."""
+"""Number of points of a runtime distribution, on a logarithmic scale of simulations."""
 
 
 def solved(curves: Curves, spread: Array, points: NDArray[np.int64]) -> Array:
-    """(P,) share of pairs of run and threshold reached after each of `points` simulations."""
+    """Compute the share of (run, threshold) pairs that are reached.
+
+    Args:
+        curves: values of the deciding metric.
+        spread: thresholds.
+        points: (P,) numbers of simulations.
+
+    Returns:
+        (P,) shares.
+    """
     times = np.concatenate([reached(curves, float(t)) for t in spread])
     return np.array([(times <= k).mean() for k in points])
 
 
 def share_table(curves: Curves, spread: Array) -> pd.DataFrame:
-    """Runtime distributions, `SHARE_COLUMNS`: the share of (run, threshold) pairs reached for good,
-    at numbers of simulations on a logarithmic scale and at those that tables name.
+    """Compute runtime distributions: the share of (run, threshold) pairs that are reached.
+
+    The numbers of simulations are those on a logarithmic scale and those of the tables.
 
     Args:
-        curves: of the deciding metric, all ranges.
+        curves: values of the deciding metric in all ranges.
         spread: thresholds of that metric.
+
+    Returns:
+        Table with the columns `SHARE_COLUMNS`.
     """
     budget = curves.values.shape[1] - 1
     between = np.geomspace(1, budget, _POINTS).astype(int)

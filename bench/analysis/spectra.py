@@ -1,4 +1,4 @@
-"""The table of what targets' data identify: identifiability.csv."""
+"""Build the table identifiability.csv: which parameter combinations the data identify."""
 
 from __future__ import annotations
 
@@ -16,8 +16,15 @@ COLUMNS = ["experiment", "target", "range", "direction", "eigenvalue", "sigma", 
 def spectra_table(
     experiment: Experiment, spectra: Mapping[str, Spectrum], parameters: Sequence[Parameter]
 ) -> pd.DataFrame:
-    """A row a target and direction, the stiffest first: eigenvalue, 1 sigma, and the parameters'
-    components.
+    """Build a table with one row per target and direction, the stiffest direction first.
+
+    Args:
+        experiment: experiment of the targets.
+        spectra: identifiability spectrum by target.
+        parameters: tuned parameters.
+
+    Returns:
+        Table of eigenvalues, standard deviations and the components of each parameter.
     """
     lines = [
         [

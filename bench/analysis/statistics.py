@@ -1,4 +1,4 @@
-"""The numbers behind the tables and figures of one comparison, each computed once."""
+"""Compute the statistics behind the tables and figures of one comparison, each one once."""
 
 from __future__ import annotations
 
@@ -16,26 +16,29 @@ from bench.analysis.tuner_ranking import failure_notes, final_order, rank_tuners
 from bench.problem.experiment import Experiment
 
 PRICED = 3
-"""Levels, the loosest first, that have prices: tighter ones hardly a tuner reaches."""
+"""Number of thresholds for which costs are computed, the loosest first.
+
+Few tuners reach the tighter ones.
+"""
 
 
 class Statistics:
-    """What decides a comparison, and what reaching it took.
+    """Statistics of one comparison: the deciding metric, rankings, medians and costs.
 
     Args:
-        experiment: what was compared.
+        experiment: configuration of the comparison.
         runs: rows of runs.parquet.
         statuses: rows of status.csv.
         costs: (simulations, seconds) of one training, by tuner.
 
     Attributes:
-        metric: that decides, see `primary`.
-        runs: those that have it.
-        curves: the metric of every run.
+        metric: name of the deciding metric, see `primary`.
+        runs: runs that have the deciding metric.
+        curves: deciding metric of every run.
         spread: thresholds of the runtime distribution.
         levels: thresholds of the tables.
-        all_runs: those too that lack the metric that decides.
-        floor: errors of the deciding metric below this count as equal to it.
+        all_runs: all runs, including those without the deciding metric.
+        floor: errors of the deciding metric below this value count as equal to it.
     """
 
     def __init__(
@@ -52,37 +55,39 @@ class Statistics:
         self.spread, self.levels = thresholds(self.curves, in_widths)
         self.floor = experiment.negligible_error
         if not in_widths:
-            # On a recording no error is known to be zero: the least one stands for it.
+            # For a recording no error is known to be zero; the smallest median error is used
+            # instead.
             self.floor = (1.0 + self.floor) * _least_median(self.curves)
         self.all_runs = runs
         self._curves: dict[str, Curves] = {}
         self._medians: dict[tuple[str, str], pd.DataFrame] = {}
 
     def of(self, kind: str) -> pd.DataFrame:
-        """All rows of a range."""
+        """Return all rows of a range."""
         return self.all_runs[self.all_runs["range"] == kind]
 
     @cached_property
     def targets(self) -> dict[str, int]:
-        """Targets of each range of which there are runs."""
+        """Number of targets of each range that has runs."""
         counts = self.all_runs.groupby("range", sort=False)["target"].nunique()
         return {str(kind): int(count) for kind, count in counts.items()}
 
     @cached_property
     def ranking(self) -> pd.DataFrame:
-        """Tuners ranked in each range; see `bench.analysis.tuner_ranking.rank_tuners`."""
+        """Ranks of the tuners in each range; see `bench.analysis.tuner_ranking.rank_tuners`."""
         return rank_tuners(self.curves, self._budget, self.floor)
 
     @cached_property
     def order(self) -> list[str]:
-        """Tuners over all ranges, the best first: the order of legends. Tuners without a run that
-        has the deciding metric come last.
+        """Tuners ranked over all ranges, the best first; the order of legends.
+
+        Tuners without a run that has the deciding metric come last.
         """
         order = final_order(self.curves, self._budget, self.floor)
         return [*order, *(t for t in self._all.keys["tuner"].unique() if t not in order)]
 
     def order_in(self, kind: str) -> list[str]:
-        """Tuners of one range after all simulations, the best first."""
+        """Return the tuners of one range after all simulations, the best first."""
         last = self.ranking[self.ranking["simulations"] == self._budget]
         ranked = list(last.loc[last["range"] == kind, "tuner"])
         return [*ranked, *(t for t in self.order if t not in ranked)]
@@ -100,15 +105,18 @@ class Statistics:
 
     @cached_property
     def notes(self) -> dict[str, str]:
-        """What legends and tables say of tuners some of whose runs failed."""
+        """Notes of legends and tables about tuners with failed runs, by tuner."""
         failed = pd.Series(self._all.failed).groupby(self._all.keys["tuner"], sort=False)
         return failure_notes({str(t): (int(bad.sum()), len(bad)) for t, bad in failed})
 
     def coinciding(self, shown: Sequence[tuple[str, str]]) -> dict[str, str]:
-        """Which tuners' curves lie below another's: ``same as hybrid up to 2``, by tuner.
+        """Find tuners whose curves are hidden below another curve.
 
         Args:
             shown: metric and range of each panel of curves.
+
+        Returns:
+            Note by tuner, such as ``same as hybrid up to 2``.
         """
         drawn: dict[str, list[pd.Series[float]]] = {}
         for metric, kind in shown:
@@ -117,8 +125,10 @@ class Statistics:
         return coinciding(drawn)
 
     def floor_of(self, metric: str) -> float | None:
-        """The error below which tuners count as equal, in the unit of a metric; None for metrics
-        that decide nothing.
+        """Return the error below which tuners count as equal, in the unit of a metric.
+
+        Returns:
+            Error; None for a metric that does not decide the comparison.
         """
         if metric == self.metric:
             return self.floor
@@ -126,23 +136,29 @@ class Statistics:
         return self.floor * self.unit if decides else None
 
     def labelled(self, tuner: str) -> str:
-        """The tuner's name, and how many of its runs failed where some did."""
+        """Return the tuner's name, with its number of failed runs if there are any."""
         return f"{tuner} [{self.notes[tuner]}]" if tuner in self.notes else tuner
 
     @cached_property
     def unit(self) -> float:
-        """What the floor and the medians of the ranking are multiplied by to be errors of the one
-        parameter in its own unit; 1 where there are several, or none whose truth is known.
+        """Factor that converts the floor and the medians to the unit of the single parameter.
+
+        It is 1 if there are several parameters, or none whose true value is known.
         """
         if self.metric != "param_error" or "param_abs_error" not in self.runs:
             return 1.0
-        # One is the other times the width of the training range.
+        # The absolute error is the relative error times the width of the training range.
         largest = float(self.runs["param_error"].max())
         return float(self.runs["param_abs_error"].max()) / largest if largest > 0 else 1.0
 
     def medians(self, metric: str, kind: str) -> pd.DataFrame:
-        """Medians of a metric against simulations in a range, of the runs that have it; see
-        `bench.analysis.medians.median_curves`.
+        """Return medians of a metric against simulations in a range, of the runs that have it.
+
+        See `bench.analysis.medians.median_curves`.
+
+        Args:
+            metric: name of the metric.
+            kind: range of the targets.
         """
         key = metric, kind
         if key not in self._medians:
@@ -151,7 +167,7 @@ class Statistics:
         return self._medians[key]
 
     def _of_all(self, metric: str) -> Curves:
-        """A metric of all runs that have it."""
+        """Return the curves of a metric for all runs that have it."""
         if metric not in self._curves:
             there = self.all_runs[metric].notna()
             rows = self._all if there.all() else self._laid_out(self.all_runs[there])
@@ -160,7 +176,7 @@ class Statistics:
 
     @cached_property
     def _all(self) -> Rows:
-        """All rows; most often those that decide, which are laid out already."""
+        """Table of all runs; equal to the table of the deciding runs if these are all runs."""
         whole = len(self.runs) == len(self.all_runs)
         return self._rows if whole else self._laid_out(self.all_runs)
 
@@ -169,7 +185,7 @@ class Statistics:
 
     @property
     def parameter_metric(self) -> str:
-        """One parameter's error counts in its own unit, several ones' in training widths."""
+        """Name of the parameter error: absolute for one parameter, else in training widths."""
         return "param_abs_error" if "param_abs_error" in self.all_runs else "param_error"
 
     @cached_property
@@ -181,12 +197,12 @@ class Statistics:
 
     @cached_property
     def shares(self) -> pd.DataFrame:
-        """The runtime distribution of every range; see `bench.analysis.runtimes.share_table`."""
+        """Runtime distribution of every range; see `bench.analysis.runtimes.share_table`."""
         return share_table(self.curves, self.spread)
 
     @cached_property
     def prices(self) -> dict[float, dict[str, dict[str, Price]]]:
-        """What every tuner costs: by level (the first `PRICED`), by range, by tuner."""
+        """Cost of every tuner by threshold (the first `PRICED`), by range, by tuner."""
         return {level: self._prices(level) for level in self.levels[:PRICED]}
 
     def _prices(self, level: float) -> dict[str, dict[str, Price]]:
@@ -208,8 +224,9 @@ class Statistics:
 
     @cached_property
     def level(self) -> float:
-        """The tightest level that at least half of the tuners reach in some run, in every range;
-        else the loosest.
+        """Tightest threshold that at least half of the tuners reach in every range.
+
+        It is the loosest threshold if there is no such threshold.
         """
         for level in sorted(self.prices):
             if all(_half(by_tuner) for by_tuner in self.prices[level].values()):
@@ -218,7 +235,7 @@ class Statistics:
 
 
 def _least_median(curves: Curves) -> float:
-    """The smallest median over runs of any tuner's final error; 0 where every run failed."""
+    """Return the smallest median final error of any tuner; 0 if every run failed."""
     medians = [float(np.median(curves.of(tuner=t).final())) for t in curves.tuners()]
     return min((m for m in medians if np.isfinite(m)), default=0.0)
 

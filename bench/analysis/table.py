@@ -1,9 +1,9 @@
-"""Error against number of simulations: the table of a comparison.
+"""Build the table of error against number of simulations of a comparison.
 
 A run that ended early counts with its last recommendation. A target's value is the mean over its
-seeds; median and mean are over targets, and `low`..`high` is a 95 % percentile-bootstrap interval
-of the mean over targets (Efron & Tibshirani 1993, ch. 13), so that seeds of one target are not
-taken for independent evidence.
+seeds. Median and mean are over targets, and `low`..`high` is a 95 % percentile-bootstrap interval
+of the mean over targets (Efron & Tibshirani 1993, ch. 13). Seeds of one target are therefore not
+counted as independent evidence.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from bench.store.schema import METRICS
 from sims.base import Array
 
 CHECKPOINTS = (0, 1, 2, 3, 5, 10, 20, 50, 100)
-"""Numbers of simulations that tables and axes name."""
+"""Numbers of simulations that are used in tables and on axes."""
 COLUMNS = [
     "experiment",
     "tuner",
@@ -42,7 +42,7 @@ COLUMNS = [
 
 
 def checkpoints(budget: int) -> list[int]:
-    """The standard numbers of simulations up to the budget, and the budget itself."""
+    """Return the standard numbers of simulations up to the budget, and the budget itself."""
     return sorted({k for k in CHECKPOINTS if k <= budget} | {budget})
 
 
@@ -53,14 +53,17 @@ def table(
     trainings: Mapping[str, tuple[float, float]] | None = None,
     resamples: int = 2000,
 ) -> pd.DataFrame:
-    """The table of a comparison in long form, columns as `COLUMNS`.
+    """Build the table of a comparison in long form.
 
     Args:
         runs: rows of runs.parquet.
         statuses: rows of status.csv.
-        budget: largest number of simulations to report.
+        budget: largest number of simulations in the table.
         trainings: simulations and seconds of one training, by tuner.
-        resamples: bootstrap resamples.
+        resamples: number of bootstrap resamples.
+
+    Returns:
+        Table with the columns `COLUMNS`.
     """
     points = checkpoints(budget)
     rows = Rows(runs, statuses, budget)
@@ -84,7 +87,7 @@ def table(
                 errors, times = values[:, i], (seconds[0][i], seconds[1][i])
                 key = (experiment, tuner, kind, k, metric)
                 lines.append((*key, *errors, *counts, *fit, *times))
-    # Who could not be used has a line too: nothing is left out in silence.
+    # A tuner that could not be used has a row too, so that the table names every tuner.
     skipped = statuses[statuses["status"] == "skipped"]
     name = runs["experiment"].iloc[0] if len(runs) else ""
     nothing = (0, "", *[np.nan] * 4, 0, 1, 0.0, 0.0, np.nan, np.nan)
@@ -99,19 +102,29 @@ def _over_targets(
     names: tuple[str, str, str],
     resamples: int,
 ) -> Array:
-    """(4, len(points)): median, mean, low and high over targets of the runs in rows `mine`."""
+    """Compute median, mean, low and high over targets of the runs in rows `mine`.
+
+    Returns:
+        (4, len(points)) values.
+    """
     _, groups = curves.where(np.isin(np.arange(len(curves.used)), mine)).by_target()
     values = mean_over_seeds(curves.values[mine][:, points], groups)
     low, high = interval(values, means, *names, resamples=resamples)
     with warnings.catch_warnings():
-        # A column of failures alone has no mean: NaN, which is shown.
+        # NumPy warns about columns of NaN alone; the result NaN is shown in the table.
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.array([np.nanmedian(values, axis=0), np.nanmean(values, axis=0), low, high])
 
 
 def target_curves(curves: Curves, points: list[int]) -> pd.DataFrame:
-    """One row a target (sorted), one column for each of `points`: the mean over the seeds of its
-    runs.
+    """Compute the mean over seeds for each target.
+
+    Args:
+        curves: values of the metric.
+        points: numbers of simulations.
+
+    Returns:
+        Table with one row per target (sorted) and one column per number of simulations.
     """
     names, groups = curves.by_target()
     values = mean_over_seeds(curves.values[:, points], groups)
@@ -119,7 +132,17 @@ def target_curves(curves: Curves, points: list[int]) -> pd.DataFrame:
 
 
 def summary(table: pd.DataFrame, metric: str, kind: str, order: Sequence[str]) -> pd.DataFrame:
-    """Median error by tuner (rows, as in `order`) and number of simulations (columns)."""
+    """Tabulate median errors by tuner and number of simulations.
+
+    Args:
+        table: rows of `table`.
+        metric: name of the metric.
+        kind: range of the targets.
+        order: order of the tuners.
+
+    Returns:
+        Medians with one row per tuner and one column per number of simulations.
+    """
     part = table[(table["metric"] == metric) & (table["range"] == kind)]
     medians = part.pivot(index="tuner", columns="simulations", values="median")
     return medians.reindex([tuner for tuner in order if tuner in medians.index])

@@ -54,15 +54,17 @@ SIGNIFICANCE = 0.05
 _RANKED_AFTER = (1, 3, 10)
 """Numbers of simulations after which tuners are ranked, in addition to the whole budget."""
 _NO_ERROR = 100.0
-"""Logarithm above which no error lies, only the number that stands for a failed run."""
+"""Threshold of log error; larger values are the number that represents a failed run."""
 BEST, EQUAL, UNDECIDED, WORSE, FAILED = "best", "equal", "not decided", "worse", "failed"
-"""Verdicts: first of the ranking; same rank as the first and not worse; lower rank, but the test
-does not decide; the test decides; all runs failed.
+"""Verdicts on a tuner.
+
+`BEST`: first of the ranking. `EQUAL`: same rank as the first and not worse. `UNDECIDED`: lower
+rank, but the test does not decide. `WORSE`: the test decides. `FAILED`: all runs failed.
 """
 
 
 def ranked_after(budget: int) -> list[int]:
-    """Numbers of simulations after which tuners are ranked: 1, 3, 10 and the whole budget."""
+    """Return the numbers of simulations after which tuners are ranked: 1, 3, 10 and the budget."""
     return [k for k in _RANKED_AFTER if k < budget] + [budget]
 
 
@@ -79,14 +81,14 @@ def rank_tuners(curves: Curves, budget: int, floor: float) -> pd.DataFrame:
     """Rank the tuners of each experiment and range after 1, 3, 10 and all simulations.
 
     Args:
-        curves: the error that decides, of every run.
+        curves: deciding error of every run.
         budget: largest number of simulations.
-        floor: errors below this count as equal to it.
+        floor: errors below this value count as equal to it.
 
     Returns:
-        A row for each tuner, in the order of the ranking, columns `RANKING_COLUMNS`.
-        `error_ratio` is the tuner's median over the best one's, `targets_worse` the number of
-        targets on which its error is larger.
+        One row per tuner, in the order of the ranking, columns `RANKING_COLUMNS`. `error_ratio` is
+        the tuner's median over the best one's, `targets_worse` the number of targets on which its
+        error is larger.
     """
     parts = []
     for (experiment, kind), _ in curves.keys.groupby(["experiment", "range"], sort=False):
@@ -97,20 +99,25 @@ def rank_tuners(curves: Curves, budget: int, floor: float) -> pd.DataFrame:
 
 
 def final_order(curves: Curves, budget: int, floor: float) -> list[str]:
-    """Tuners by their rank after the whole budget, over all targets of all ranges; best first.
+    """Rank tuners after the whole budget, over all targets of all ranges; best first.
 
-    Tuners all of whose runs failed come last.
+    Tuners come last if all their runs failed.
+
+    Args:
+        curves: deciding error of every run.
+        budget: largest number of simulations.
+        floor: errors below this value count as equal to it.
     """
     return list(_rankings(curves, budget, floor)[budget].order)
 
 
 class _Ranking(NamedTuple):
-    """The tuners after some number of simulations.
+    """Ranking of the tuners after a number of simulations.
 
     Attributes:
-        logs: logarithms of errors, a row a target, a column a tuner.
-        ranks: of each tuner, 1 is best.
-        order: the tuners, the best first.
+        logs: logarithms of errors, one row per target, one column per tuner.
+        ranks: rank of each tuner, 1 is best.
+        order: tuners, the best first.
     """
 
     logs: pd.DataFrame
@@ -119,13 +126,13 @@ class _Ranking(NamedTuple):
 
 
 def _rankings(curves: Curves, budget: int, floor: float) -> dict[int, _Ranking]:
-    """The ranking after each of `ranked_after`."""
+    """Compute the ranking after each number of simulations of `ranked_after`."""
     failed = {t: bool(curves.of(tuner=t).failed.all()) for t in curves.tuners()}
     rankings: dict[int, _Ranking] = {}
     earlier: list[pd.Series[float]] = []
     for k in ranked_after(budget):
         logs = log_errors(curves, k, floor)
-        # Rounded, so that errors that differ by the last bits share a rank.
+        # Rounding gives errors that differ by the last bits the same rank.
         medians, means = logs.median().round(9), logs.mean().round(9)
         ranks = medians.rank(method="min")
         keys = [pd.Series(failed), medians, means, *reversed(earlier)]
@@ -136,7 +143,7 @@ def _rankings(curves: Curves, budget: int, floor: float) -> dict[int, _Ranking]:
 
 
 def _verdicts(ranking: _Ranking, curves: Curves, key: tuple[str, str, int]) -> pd.DataFrame:
-    """Rows of one ranking: each tuner tested against the first."""
+    """Build the rows of one ranking, with each tuner tested against the first."""
     logs, ranks, order = ranking
     runs = {t: curves.of(tuner=t).failed for t in order}
     delivered = [t for t in order if not runs[t].all()]
@@ -172,16 +179,19 @@ def _verdicts(ranking: _Ranking, curves: Curves, key: tuple[str, str, int]) -> p
 
 
 def _median_error(logs: pd.Series[float]) -> float:
-    """The median error, infinite where half of the targets failed."""
+    """Return the median error; infinite if half of the targets failed."""
     middle = float(logs.median())
     return float(np.exp(middle)) if middle < _NO_ERROR else np.inf
 
 
 def failure_notes(failed: Mapping[str, tuple[int, int]]) -> dict[str, str]:
-    """What is said in addition to a tuner's name where runs of it failed.
+    """Build the notes that follow the names of tuners with failed runs.
 
     Args:
         failed: (failed runs, runs) by tuner.
+
+    Returns:
+        Note by tuner with failed runs.
     """
     return {
         tuner: "all runs failed" if bad == runs else f"{bad} of {runs} runs failed"

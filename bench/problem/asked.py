@@ -1,6 +1,4 @@
-"""The experiment that a robot's model file and a recording stand for, without a file of their own
-that says so.
-"""
+"""Build an experiment from a robot's model file and a recording, without an experiment file."""
 
 from __future__ import annotations
 
@@ -25,28 +23,29 @@ TUNERS = (
     "tunenet",
     "hybrid",
 )
-"""That are compared where nobody says which."""
+"""Tuners that are compared by default."""
 TARGETS, BUDGET, TRAINING = 5, 50, 480
-"""Starts or targets, simulations on each, and those that a learned tuner may learn from."""
+"""Defaults: number of starts or targets, simulations on each, and training simulations."""
 NOISE = 1e-3
-"""rad or m, of the encoders of simulated targets."""
+"""Default encoder noise of simulated targets, standard deviation in rad or m."""
 HELD_OUT = 2
-"""Unseen runs of each simulated target."""
+"""Default number of held-out runs of each simulated target."""
 
 
 def asked(
     model: str | Path | None, recording: str | Path | None, free: Sequence[str]
 ) -> Experiment:
-    """The experiment that tunes numbers of a model file to a recording, or to targets that it
-    simulates itself where there is none.
+    """Build an experiment that tunes numbers of a robot's model file.
+
+    They are tuned to a recording, or to simulated targets if there is no recording.
 
     Args:
-        model: MJCF or URDF; the recording's own where None.
-        recording: its table.
-        free: numbers of the model file, as ``damping@*``.
+        model: MJCF or URDF file; None for the one that the recording's description names.
+        recording: table of the recording; None for simulated targets.
+        free: numbers of the model file, such as ``damping@*``.
 
     Raises:
-        InputError: neither names a model file, or there is no such number in it.
+        InputError: no model file is given, or it does not contain such a number.
     """
     file = Path(model) if model is not None else None
     if recording is not None:

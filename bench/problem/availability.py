@@ -1,4 +1,4 @@
-"""What an experiment needs and this machine lacks: a data set, packages, tuners."""
+"""Find what an experiment needs and this machine lacks: a data set, packages, tuners."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from sims.engines import NAMES, missing_packages
 
 @dataclass(frozen=True)
 class Availability:
-    """What is missing for an experiment.
+    """Missing requirements of an experiment.
 
     Attributes:
-        data_set: that a command of the project downloads.
-        skipped: why the experiment cannot run here; empty where it can, or where it only lacks the
-            data set.
-        tuners: reason by label of each tuner that is left out, as it cannot run here.
+        data_set: missing data set that a command of the project downloads; None if none is missing.
+        skipped: why the experiment cannot run here; empty if it can run, or if only the data set is
+            missing.
+        tuners: reason by label of each tuner that cannot run here and is left out.
     """
 
     data_set: DataSet | None
@@ -30,7 +30,7 @@ class Availability:
 
 
 def availability(experiment: Experiment) -> Availability:
-    """Find what is missing for an experiment; for one that names others, for all of them."""
+    """Find what is missing for an experiment, or for all experiments that it names."""
     if experiment.experiments:
         return _together(experiment)
     data_set = _missing_data_set(experiment)
@@ -43,7 +43,7 @@ def availability(experiment: Experiment) -> Availability:
 
 
 def _together(experiment: Experiment) -> Availability:
-    """What is missing for the experiments that one names."""
+    """Combine what is missing for the experiments that this one names."""
     parts = {each.name: availability(each) for each in expand(experiment)}
     data_sets = [part.data_set for part in parts.values() if part.data_set]
     skipped = [f"{name} {part.skipped}" for name, part in parts.items() if part.skipped]
@@ -52,8 +52,9 @@ def _together(experiment: Experiment) -> Availability:
 
 
 def _missing_simulator(experiment: Experiment) -> str:
-    """Why the simulator of an experiment cannot be used here; empty where it can, or where it is
-    not a registered one.
+    """Return why the experiment's registered simulator cannot be used here.
+
+    The text is empty if it can be used, or if the simulator is not a registered one.
     """
     if experiment.model or experiment.simulator not in simulators.names():
         return ""
@@ -65,7 +66,7 @@ def _missing_simulator(experiment: Experiment) -> str:
 
 
 def _missing_data_set(experiment: Experiment) -> DataSet | None:
-    """The data set that an experiment needs and that is not here."""
+    """Return the data set that an experiment needs and that is missing here."""
     wanted = [("robot", experiment.model)] if experiment.model else []
     if experiment.recording:
         wanted.append(("recording", experiment.recording.path))
@@ -77,8 +78,9 @@ def _missing_data_set(experiment: Experiment) -> DataSet | None:
 
 
 def _missing_engine(experiment: Experiment) -> str:
-    """Why an engine of an experiment, that of the tuned simulator or of the world which makes the
-    targets, cannot be used here; empty where all can.
+    """Return why an engine of an experiment cannot be used here; empty if all can.
+
+    The engines are those of the tuned simulator and of the simulator that makes the targets.
     """
     settings = [experiment.settings, *([experiment.world] if experiment.world else [])]
     engines = [str(each.get("engine") or _default_engine(experiment)) for each in settings]
@@ -91,7 +93,7 @@ def _missing_engine(experiment: Experiment) -> str:
 
 
 def _default_engine(experiment: Experiment) -> str:
-    """The engine of an experiment that names none; empty where its simulator is not known."""
+    """Return the default engine of an experiment; empty if its simulator is not known."""
     if experiment.model:
         return "mujoco"
     if experiment.simulator not in simulators.names():
@@ -100,7 +102,7 @@ def _default_engine(experiment: Experiment) -> str:
 
 
 def _missing_tuners(experiment: Experiment) -> Mapping[str, str]:
-    """Reason by label of each tuner of an experiment that cannot run here."""
+    """Return the reason by label for each tuner of an experiment that cannot run here."""
     reasons = {}
     for entry in experiment.tuners:
         try:

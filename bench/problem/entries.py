@@ -1,4 +1,4 @@
-"""The tuners that an experiment names: as a list, or as a table for each."""
+"""Parse the tuners of an experiment file: a list, or a table for each tuner."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Entry:
     randomised: bool = False
 
     def table(self) -> dict[str, Any]:
-        """The entry as the table ``[tuners.LABEL]``."""
+        """Return the entry as the table ``[tuners.LABEL]``."""
         given = {key: value for key, value in asdict(self).items() if value is not None}
         del given["label"]
         if not self.randomised:
@@ -34,15 +34,15 @@ class Entry:
 
 
 def entries_of(path: Path, value: Any) -> tuple[Entry, ...]:
-    """The entries of an experiment file, in its order.
+    """Parse the tuner entries of an experiment file, in the order of the file.
 
     Args:
-        path: the file.
-        value: what stands under ``tuners``: a table of tables by label, or a list of registered
+        path: experiment file.
+        value: value of the key ``tuners``: a table of tables by label, or a list of registered
             names and of tables that name their tuner.
 
     Raises:
-        InputError: a fault in it, in one line.
+        InputError: the value is not valid.
     """
     if isinstance(value, dict):
         tables = value.items()
@@ -52,7 +52,8 @@ def entries_of(path: Path, value: Any) -> tuple[Entry, ...]:
     listed: list[Entry] = []
     for place, item in enumerate(value):
         entry = _listed(path, f"tuners[{place}]", item)
-        # Tables and figures tell tuners apart by their labels; TOML's own keys cannot be twice.
+        # Tables and figures distinguish tuners by label; TOML keys cannot occur twice, list items
+        # can.
         if entry.label in [other.label for other in listed]:
             twice = f"{entry.label} stands twice; give one of them a label"
             raise InputError(f"{path}: tuners: {twice}")
@@ -65,7 +66,7 @@ def _listed(path: Path, where: str, item: Any) -> Entry:
         return Entry(item, item)
     if not isinstance(item, dict):
         raise fault(path, where, "a name or a table", item)
-    own = dict(item)  # what was read stays as it is
+    own = dict(item)  # a copy, so that the parsed document is not changed
     label = own.pop("label", own.get("tuner"))
     if not isinstance(label, str):
         raise fault(path, where, 'a table with tuner = "NAME"', item)

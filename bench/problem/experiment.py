@@ -1,8 +1,8 @@
-"""An experiment as a data file: which tuners, on which simulator and targets, with what budget.
+"""Experiment configuration: parse and check experiment files, and expand them.
 
-The file's keys are the fields of `Experiment`; everything else is derived. `Experiment.document`
-gives the exact configuration back, defaults filled in and command-line changes applied, and is what
-a run stores.
+An experiment states which tuners are compared, on which simulator and targets, and with what
+budget. The keys of a file are the fields of `Experiment`. `Experiment.document` returns the exact
+configuration, including defaults and command-line changes; it is stored with every run.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ __all__ = [
 ]
 
 RANGES = ("in", "wide", "real")
-"""Where targets come from: the training range, the bounds, a recording."""
+"""Origin of targets: the training range, the bounds, or a recording."""
 
 _LONGEST = 1e9
-"""Seconds of a limit beyond which waiting for it overflows; infinity is none."""
+"""Maximum finite time limit in seconds; a longer one overflows timers. Infinity means no limit."""
 _MOST_MEMORY = 10**9
-"""MiB of a limit beyond which no machine has them."""
+"""Maximum memory limit in MiB; no machine has more memory."""
 ISOLATIONS = ("run", "tuner")
-"""How long a tuner's process lives."""
+"""Lifetimes of a tuner's process: one run, or all runs of the tuner."""
 
 Drawn = float | Pair
 """A number, or the range from which each scenario draws one uniformly."""
 
 
 class Change(TypedDict, total=False):
-    """What an experiment may change of a parameter; see `sims.base.Parameter`."""
+    """Parameter properties that an experiment may change; see `sims.base.Parameter`."""
 
     nominal: float
     bounds: Pair
@@ -236,7 +236,7 @@ class Experiment:
             if entry.randomised and not self.nuisance and not self.experiments:
                 wanted = "a [nuisance] table of effects to train over"
                 raise InputError(f"{who}: tuner {entry.label} is randomised: expected {wanted}")
-        if self.memory < 0 or not self.timeout > 0:  # so that NaN is refused too
+        if self.memory < 0 or not self.timeout > 0:  # negated, so that NaN is refused too
             raise InputError(f"{who}: expected timeout > 0 and memory >= 0")
         if self.memory > _MOST_MEMORY or _LONGEST < self.timeout < math.inf:
             wanted = f"timeout of at most {_LONGEST:g} s and memory of at most {_MOST_MEMORY:g} MiB"
@@ -246,7 +246,7 @@ class Experiment:
             raise fault(who, "ranges", "one or more, each once", list(self.ranges))
         known("isolation", [self.isolation], ISOLATIONS)
         check_commitment(who, self.salt, self.salt_sha256)
-        # A recording has no range to draw from, and ranges have no recording.
+        # The range 'real' needs a recording, and the other ranges must not have one.
         real = "real" in self.ranges
         if real != (self.recording is not None) or (real and len(self.ranges) != 1):
             raise InputError(f"{who}: range 'real' and a [recording] go together, and alone")
@@ -256,7 +256,7 @@ class Experiment:
         self._check_calibration(who)
 
     def _check_calibration(self, who: str) -> None:
-        """Refuse a calibration of which nothing could be learned."""
+        """Raise an error if the calibration has no runs to fit, or is not applicable."""
         if self.calibration is None:
             return
         runs, held_out = self.calibration.runs, self.calibration.held_out
@@ -266,7 +266,7 @@ class Experiment:
             raise InputError(f"{who}: [calibration] needs simulated targets, and no shot")
 
     def _check_words(self, who: str) -> None:
-        """Refuse texts that no figure, table or path could hold."""
+        """Raise an error for texts that do not fit into figures, tables or paths."""
         text(who, "title", self.title)
         text(who, "says", self.says, most=WORDS)
         text(who, "same_targets_as", self.same_targets_as)
@@ -280,7 +280,7 @@ class Experiment:
             text(who, "tuners: label", entry.label, most=NAME)
 
     def _check_numbers(self, who: str) -> None:
-        """Refuse numbers that are none, or beyond all that can be meant."""
+        """Raise an error for numbers that are not finite or out of range."""
         if not 0 <= finite(who, "negligible_error", self.negligible_error) < 1:
             wanted = "a share of the training range, from 0 to below 1"
             raise fault(who, "negligible_error", wanted, self.negligible_error)
@@ -304,10 +304,10 @@ class Experiment:
                     finite(who, f"{where}.{name}", end)
 
     def document(self) -> dict[str, Any]:
-        """The whole configuration as TOML tables; `parse` of it gives an equal experiment."""
+        """Return the whole configuration as TOML tables, the inverse of `parse`."""
         document = {key: value for key, value in asdict(self).items() if value is not None}
         del document["name"]
-        # What is run never has the first two, and few have the last.
+        # An experiment that is run never has the first two keys, and rarely the last two.
         for rare in ("sweep", "experiments", "nuisance", "diagnosis"):
             if not document[rare]:
                 del document[rare]
@@ -316,27 +316,31 @@ class Experiment:
 
     @property
     def fixed(self) -> dict[str, float]:
-        """The constants that are the same in every scenario."""
+        """Constants that are equal in every scenario."""
         constants = self.constants.items()
         return {name: value for name, value in constants if not isinstance(value, tuple)}
 
     def chosen(self, **changes: Any) -> Experiment:
-        """This experiment with the given fields replaced where they are not None."""
-        # None is what a command line leaves out.
+        """Return this experiment with the given fields replaced if they are not None."""
+        # None means that an option is not given on the command line.
         return replace(self, **{k: v for k, v in changes.items() if v is not None})
 
     def with_seeds(self, seeds: int) -> Experiment:
-        """The same number of seeds for every tuner whose entry does not ask for fewer."""
+        """Return this experiment with a number of seeds.
+
+        Entries of tuners with fewer seeds keep their number.
+        """
         entries = []
         for entry in self.tuners:
-            # An entry without a number takes the experiment's, and must go on doing so.
+            # An entry without a number keeps following the experiment's number.
             fewer = min(entry.seeds, seeds) if entry.seeds else None
             entries.append(replace(entry, seeds=fewer))
         return replace(self, seeds=seeds, tuners=tuple(entries))
 
     def with_tuners(self, labels: Sequence[str]) -> Experiment:
-        """Only the tuners of these labels, in this order; a registered name that has no entry gets
-        one.
+        """Return this experiment with only the given tuners, in this order.
+
+        A registered name that has no entry gets a new one.
         """
         entries = {entry.label: entry for entry in self.tuners}
         chosen = tuple(entries.get(label, Entry(label, label)) for label in labels)
@@ -344,20 +348,23 @@ class Experiment:
 
 
 def plain_name(text: str) -> str:
-    """A name for tables, files and command lines."""
+    """Convert a text to a name that is valid in tables, file names and command lines."""
     return re.sub(r"[^\w.+-]+", "_", text)[:60] or "robot"
 
 
 def model_beside(model: str, experiment: Path) -> str:
-    """The path of an experiment's model file, made absolute where it lies beside the experiment's
-    file, as that of a recording is.
+    """Return the path of a model file, made absolute if the file is next to the experiment file.
+
+    Args:
+        model: path of the model file in the experiment.
+        experiment: path of the experiment file.
     """
     file = experiment.parent / model
     return str(file.resolve()) if is_there(file) else model
 
 
 def is_there(file: Path) -> bool:
-    """Whether it is a file; what no file could be called is none."""
+    """Return whether a path is a file; False for a path that no file can have."""
     try:
         return file.is_file()
     except (OSError, ValueError):
@@ -365,17 +372,17 @@ def is_there(file: Path) -> bool:
 
 
 def names() -> list[str]:
-    """The experiments that come with the project."""
+    """Return the names of the experiments that come with the project."""
     folder = resources.files("bench.experiments")
     files = [file.name for file in folder.iterdir() if file.name.endswith(".toml")]
     return sorted(name.removesuffix(".toml") for name in files)
 
 
 def load(name_or_path: str) -> Experiment:
-    """An experiment of the project by name, or a user's by the path of its TOML file.
+    """Load an experiment of the project by name, or a user's experiment by its TOML file.
 
     Raises:
-        InputError: no such experiment, or a fault in its file, in one line.
+        InputError: there is no such experiment, or its file has an error.
     """
     if name_or_path in names():
         path = Path(str(resources.files("bench.experiments").joinpath(f"{name_or_path}.toml")))
@@ -388,15 +395,15 @@ def load(name_or_path: str) -> Experiment:
 
 
 def parse(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
-    """Check the tables of an experiment file.
+    """Check the tables of an experiment file and convert them to an experiment.
 
     Args:
-        name: of the experiment.
-        document: the file's tables.
-        path: the file, for messages; its recording may lie beside it.
+        name: name of the experiment.
+        document: tables of the file.
+        path: experiment file, for messages and for relative paths.
 
     Raises:
-        InputError: an unknown key or a value of another type, naming file and key.
+        InputError: there is an unknown key or a value of a wrong type; names file and key.
     """
     hints = {key: hint for key, hint in hints_of(Experiment).items() if key != "name"}
     known(f"entry of {path}", document, hints)
@@ -414,23 +421,24 @@ def parse(name: str, document: Mapping[str, Any], path: Path) -> Experiment:
         fields["experiments"] = tuple(_beside(each, path) for each in fields["experiments"])
     elif not fields.get("simulator") and not fields.get("diagnosis"):
         raise InputError(f'{path}: expected simulator = "NAME" or model = "FILE", found none')
-    # Known here only: neither a worker nor a folder of results knows where this file lay.
+    # Paths are made absolute here: workers and result folders do not know this file's location.
     if "recording" in fields:
         fields["recording"] = Source(beside(fields["recording"].path, path))
     try:
         experiment = Experiment(name=name, tuners=tuners, **fields)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    _expanded(experiment, path)  # a fault in what is swept over is a fault of this file
+    _expanded(experiment, path)  # an error in a swept value is an error of this file
     return experiment
 
 
 def expand(experiment: Experiment) -> list[Experiment]:
-    """The experiments that a file stands for: one for each combination of the values it sweeps
-    over, named ``NAME[budget=10]``; itself where it sweeps over nothing.
+    """Expand an experiment into the experiments that its file describes.
 
-    All meet the same targets: the seeds of targets depend on the file's name alone. Of a file that
-    names other experiments it is these, with what it says of their numbers and tuners.
+    A sweep gives one experiment for each combination of its values, named ``NAME[budget=10]``. All
+    have the same targets, because target seeds depend on the file's name alone. A file that names
+    other experiments gives these, with its own numbers and tuners. Any other experiment gives
+    itself.
     """
     if experiment.experiments:
         return [
@@ -451,21 +459,21 @@ OF_ALL = (
     "salt",
     "tuners",
 )
-"""Keys of a file that names other experiments which hold for all of them."""
+"""Keys of a file with several experiments that hold for each of them."""
 
 
 def _as_in(together: Experiment, name: str) -> list[Experiment]:
-    """An experiment that another one names, with the numbers and tuners of that."""
+    """Return an experiment that another one names, with the numbers and tuners of the latter."""
     one = load(name)
     if one.experiments:
         raise InputError(f"experiment {together.name}: {name} names experiments itself")
-    # A tuner of the one may have options there that the other knows nothing of.
+    # Tuners are replaced as a whole: options of one experiment may be invalid in the other.
     given = {key: getattr(together, key) for key in OF_ALL if key != "tuners" or together.tuners}
     return expand(one.chosen(**given))
 
 
 def _beside(name: str, experiment: Path) -> str:
-    """The name of an experiment, or the path of its file, absolute where that lies beside."""
+    """Return a name, or the path of an experiment file, made absolute if it is next to this one."""
     file = experiment.parent / name
     return str(file.resolve()) if name.endswith(".toml") and is_there(file) else name
 
@@ -475,7 +483,7 @@ def _expanded(experiment: Experiment, path: Path) -> list[Experiment]:
         return [experiment]
     document = experiment.document()
     del document["sweep"]
-    # A difference between two of them is then one of what is swept over, not of the draw.
+    # All combinations have the same targets, so that only the swept values make a difference.
     document["same_targets_as"] = experiment.same_targets_as or experiment.name
     expanded = []
     for label, changed in sweep.documents(path, document, experiment.sweep):

@@ -1,8 +1,7 @@
-"""Which combinations of parameters a target's data can identify, and a recommendation's error along
-them.
+"""Find the parameter combinations that a target's data identify, and the errors along them.
 
-Of N samples with white noise, each with a standard deviation of its own, the derivatives with
-respect to the parameters in units of their training ranges make the Jacobian
+For N samples with white noise, each with its own standard deviation, the derivatives with respect
+to the parameters in units of their training ranges are the Jacobian
 
     J_nk = (d y_n / d theta_k) / sigma_n                            (1)
     F = J^T J = V diag(lambda) V^T                                  (2)
@@ -12,10 +11,11 @@ deviation than (Cramer-Rao bound)
 
     sigma(v_k) = 1 / sqrt(lambda_k)                                 (3)
 
-Where that is small, the data tell much (stiff), elsewhere next to nothing (sloppy): R. N.
-Gutenkunst et al., PLoS Comput. Biol. 3(10), e189 (2007), doi:10.1371/journal.pcbi.0030189; M. K.
-Transtrum et al., J. Chem. Phys. 143, 010901 (2015), doi:10.1063/1.4923066. An error along a sloppy
-direction is no fault of the tuner: nobody could have known better.
+A direction with a small sigma is well determined by the data (stiff), one with a large sigma is not
+(sloppy): R. N. Gutenkunst et al., PLoS Comput. Biol. 3(10), e189 (2007),
+doi:10.1371/journal.pcbi.0030189; M. K. Transtrum et al., J. Chem. Phys. 143, 010901 (2015),
+doi:10.1063/1.4923066. An error along a sloppy direction is not the tuner's fault, because the data
+do not contain the information.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 from sims.base import Array, Parameter
 
 STIFF = 0.1
-"""A direction is stiff where its 1 sigma (Cramer-Rao bound) is below this share of the training
-range.
+"""Upper limit of the standard deviation of a stiff direction, in training ranges.
+
+The standard deviation is the Cramer-Rao bound.
 """
 
 STEP = 1e-4
@@ -39,12 +40,12 @@ STEP = 1e-4
 
 @dataclass(frozen=True)
 class Spectrum:
-    """What one target's data say of each direction in parameter space, the stiffest first.
+    """Fisher-information spectrum of one target's data, the stiffest direction first.
 
     Attributes:
-        values: (dim,) eigenvalues of the Fisher information, per squared training range, falling.
-        vectors: (dim, dim) their directions as columns, of length one, components in training
-            ranges; the largest component is positive.
+        values: (dim,) eigenvalues of the Fisher information per squared training range, decreasing.
+        vectors: (dim, dim) eigenvectors as columns, of length one, components in training ranges;
+            the largest component is positive.
     """
 
     values: Array
@@ -52,32 +53,35 @@ class Spectrum:
 
     @property
     def sigmas(self) -> Array:
-        """(dim,) the least 1 sigma of any unbiased estimate along each direction, in training
-        ranges; may be inf.
+        """Cramer-Rao bound (dim,) along each direction, in training ranges.
+
+        It is the smallest standard deviation of any unbiased estimate, and may be infinite.
         """
-        with np.errstate(divide="ignore"):  # data may say nothing of a direction
+        with np.errstate(divide="ignore"):  # an eigenvalue may be zero
             sigmas: Array = 1.0 / np.sqrt(self.values)  # (3)
         return sigmas
 
     @property
     def stiff(self) -> NDArray[np.bool_]:
-        """(dim,) which directions are stiff."""
+        """Boolean mask (dim,) of the stiff directions."""
         known: NDArray[np.bool_] = self.sigmas < STIFF
         return known
 
     def errors(self, errors: Array) -> tuple[Array, Array]:
-        """Root mean squares (k,) of the components along stiff and along sloppy directions; NaN
-        where there is none.
+        """Compute RMS errors along the stiff and along the sloppy directions.
 
         Args:
             errors: (k, dim) recommended minus true parameters, in training ranges.
+
+        Returns:
+            Root mean squares (k,) along stiff and along sloppy directions; NaN if there are none.
         """
         squares = (errors @ self.vectors) ** 2
         return _rms(squares[:, self.stiff]), _rms(squares[:, ~self.stiff])
 
 
 def _rms(squares: Array) -> Array:
-    """(k,) root means of squares (k, directions); NaN where there is no direction."""
+    """Return root means (k,) of squares (k, directions); NaN if there is no direction."""
     if squares.shape[1] == 0:  # numpy would warn of an empty mean
         return np.full(len(squares), np.nan)
     rms: Array = np.sqrt(squares.mean(axis=1))
@@ -87,47 +91,49 @@ def _rms(squares: Array) -> Array:
 def spectrum(
     simulate: Callable[[Array], Array], truth: Array, parameters: Sequence[Parameter], scale: Array
 ) -> Spectrum:
-    """The spectrum at `truth`, by central differences that stay within the bounds.
+    """Compute the spectrum at the true parameters, by central differences within the bounds.
 
-    A sample that a simulation near the truth does not give (NaN) tells nothing of the parameter
-    moved.
+    A sample that is missing (NaN) in a simulation near the true parameters contributes no
+    information about the changed parameter.
 
     Args:
-        simulate: parameters (n, dim), physical -> observations (n, T, C).
-        truth: (dim,), physical.
-        parameters: with their bounds and training ranges.
-        scale: (C,) 1 sigma of each channel's white noise, or its typical magnitude where no noise
-            is known.
+        simulate: parameters (n, dim) in physical units -> observations (n, T, C).
+        truth: (dim,) true parameters in physical units.
+        parameters: parameters with their bounds and training ranges.
+        scale: (C,) standard deviation of each channel's white noise, or its typical magnitude if
+            the noise is not known.
     """
     low, high = np.array([p.bounds for p in parameters]).T
     ranges = np.array([p.training_range for p in parameters])
     widths = ranges[:, 1] - ranges[:, 0]
     dim = len(parameters)
-    # One parameter up in each of the first points, down in each of the others.
+    # The first dim points have one parameter increased, the others have it decreased.
     steps = np.concatenate([np.diag(widths), -np.diag(widths)])
     moved = np.clip(truth + STEP * steps, low, high)
-    # At a bound only one side moves, and the difference is over what is left of the step.
+    # At a bound only one side moves, and the difference is divided by the shorter step.
     apart = np.diagonal(moved[:dim] - moved[dim:]) / widths
     observations = simulate(moved)
     changes = (observations[:dim] - observations[dim:]) / scale
-    # A simulation that failed has no slope.
+    # A failed simulation has no derivative.
     changes = np.nan_to_num(changes, nan=0.0, posinf=0.0, neginf=0.0)
     return of_jacobian((changes.reshape(dim, -1) / apart[:, None]).T)  # (1)
 
 
 def of_jacobian(jacobian: Array) -> Spectrum:
-    """The spectrum of the information J^T J of a Jacobian (N, dim) of observations over their
-    noise.
+    """Compute the spectrum of the Fisher information J^T J of a Jacobian.
 
-    From the singular values of J, which keeps the small eigenvalues that rounding in J^T J would
-    drown.
+    It is computed from the singular values of J, because rounding in J^T J would destroy the small
+    eigenvalues.
+
+    Args:
+        jacobian: (N, dim) derivatives of the observations divided by their noise.
     """
     dim = jacobian.shape[1]
-    # J = Q R, and the orthogonal Q changes no singular value: the long side need not be decomposed.
+    # J = Q R, and Q is orthogonal, so R (dim, dim) has the singular values of J.
     _, sizes, rows = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
     values, vectors = np.zeros(dim), rows.T
     values[: sizes.size] = sizes**2  # (2); with fewer samples than parameters the others are 0
-    # Either sign of an eigenvector is one; the same data must always give the same.
+    # The sign of an eigenvector is arbitrary; it is fixed so that results are reproducible.
     places = np.abs(vectors).argmax(axis=0)[None]
     largest = np.take_along_axis(vectors, places, axis=0)
     return Spectrum(values, vectors * np.where(largest < 0, -1.0, 1.0))

@@ -1,10 +1,12 @@
-"""Training over effects that the world may have and the simulator lacks: domain randomisation, J.
-Tobin et al., IROS 2017, arXiv 1703.06907; of dynamics X. B. Peng et al., ICRA 2018, arXiv
-1710.06537.
+"""Train with effects that the real system may have and the simulator lacks.
 
-Every training simulation draws coefficients of its own, so that a network has to find what follows
-the parameters whatever these effects do. Half of the simulations have none of them: when it tunes,
-the network compares a target that may have some with simulations that never do.
+This is domain randomisation: J. Tobin et al., IROS 2017, arXiv 1703.06907; of dynamics X. B. Peng
+et al., ICRA 2018, arXiv 1710.06537.
+
+Every training simulation draws its own coefficients, so that a network must find features that
+depend on the parameters but not on these effects. Half of the simulations have no such effects,
+because during tuning the network compares a target that may have some with simulations that never
+have any.
 """
 
 from __future__ import annotations
@@ -24,14 +26,14 @@ ABSENT = 0.5
 
 
 class Randomised(Protocol):
-    """What is trained on, as `bench.problem.problem.Problem` is.
+    """Problem that a tuner trains on, as `bench.problem.problem.Problem` is.
 
     Attributes:
-        experiment: has the effects and their ranges.
-        simulator: the one that is tuned.
-        cube: between bounds and unit cube.
-        channels: observed, in order.
-        simulated: simulations made so far.
+        experiment: experiment with the effects and their ranges.
+        simulator: simulator that is tuned.
+        cube: map between bounds and unit cube.
+        channels: observed channels, in order.
+        simulated: number of simulations made so far.
     """
 
     experiment: Experiment
@@ -42,14 +44,15 @@ class Randomised(Protocol):
 
 
 class Nuisance:
-    """The simulator of a problem with further effects, whose coefficients are drawn; those that it
-    has already with a fixed coefficient are left as they are.
+    """Simulator of a problem with additional effects whose coefficients are drawn at random.
+
+    An effect that the simulator already has with a fixed coefficient is not changed.
 
     Args:
-        problem: what is trained on.
+        problem: problem that a tuner trains on.
 
     Raises:
-        InputError: an effect that the simulator cannot have, or that is tuned.
+        InputError: the simulator cannot have an effect, or the effect is tuned.
     """
 
     def __init__(self, problem: Randomised) -> None:
@@ -57,7 +60,7 @@ class Nuisance:
         experiment = problem.experiment
         ranges = dict(experiment.nuisance)
         settings: dict[str, Any] = dict(experiment.settings)
-        # what it was extended with is known, and acts as it is
+        # The effects that the simulator was extended with are known, and keep their coefficients.
         known = settings.get("fixed", {})
         ranges = {name: ends for name, ends in ranges.items() if _effect(name) not in known}
         names = list(dict.fromkeys(_effect(name) for name in ranges))
@@ -76,14 +79,31 @@ class Nuisance:
     def simulate(
         self, rng: np.random.Generator, points: Array, scenarios: tuple[Scenario, ...]
     ) -> Array:
-        """Observations (n, T, C) of unit-cube points (n, dim), each with effects drawn by `rng`."""
+        """Simulate points with effects whose coefficients are drawn at random.
+
+        Args:
+            rng: random generator.
+            points: (n, dim) points of the unit cube.
+            scenarios: runs to simulate.
+
+        Returns:
+            Observations (n, T, C) with the samples of the scenarios concatenated.
+        """
         self._problem.simulated += len(points)
         coefficients = self.drawn(rng, len(points))
         theta = np.concatenate([self._problem.cube.physical(points), coefficients], axis=1)
         return np.concatenate([self._simulator.simulate(theta, s) for s in scenarios], axis=1)
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
-        """(count, coefficients) uniform in their ranges; rows of zeros for a share of `ABSENT`."""
+        """Draw coefficients uniformly in their ranges; a share of `ABSENT` of the rows is zero.
+
+        Args:
+            rng: random generator.
+            count: number of rows.
+
+        Returns:
+            (count, coefficients) values.
+        """
         low, high = self._ranges
         drawn = rng.uniform(low, high, size=(count, len(low)))
         there = rng.random((count, 1)) >= ABSENT
@@ -91,12 +111,12 @@ class Nuisance:
         return coefficients
 
     def close(self) -> None:
-        """Give back what the simulator holds."""
+        """Close the simulator."""
         self._simulator.close()
 
 
 def _effect(name: str) -> str:
-    """The effect of a coefficient, which is called after it or is one of several."""
+    """Return a coefficient's effect: the coefficient's name, or its part before the last dot."""
     whole, several = name.partition("@")[0], name.rpartition(".")[0]
     return several if whole not in library.names() and several in library.names() else name
 
@@ -104,7 +124,7 @@ def _effect(name: str) -> str:
 def _in_order(
     who: str, simulator: Simulator, tuned: int, ranges: Mapping[str, tuple[float, float]]
 ) -> tuple[Array, Array]:
-    """Lower and upper ends in the simulator's order; what no range is given for stays zero."""
+    """Return lower and upper bounds in the simulator's order; zero for coefficients not named."""
     names = [parameter.name for parameter in simulator.parameters[tuned:]]
     for name in ranges:
         if name not in names:

@@ -13,8 +13,8 @@ import numpy as np
 def numeric_warnings_silenced() -> Iterator[None]:
     """Silence NumPy's floating-point warnings and other RuntimeWarnings; also a decorator.
 
-    A simulation that overflows is a result: its loss is infinite, and status and report say so.
-    A warning for each of its time steps tells nobody more.
+    A simulation that overflows is a valid result: its loss is infinite, and status and report say
+    so. A warning for each of its time steps gives no further information.
     """
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)

@@ -1,4 +1,4 @@
-"""Where learned tuners train: the simulator, counted and fenced to the training range."""
+"""Training simulator of learned tuners: counted, and limited to the training range."""
 
 from __future__ import annotations
 
@@ -11,46 +11,63 @@ from methods.base import BudgetExceededError, Scene
 from sims.base import Array, Scenario, UnitCube
 
 _SLACK = 1e-9
-"""How far outside the training range a point may lie, unit cube: a sum that rounds is no breach."""
+"""Tolerance for points outside the training range, in the unit cube, because of rounding."""
 
 
 class Ground(Protocol):
-    """What is practised on, as `bench.problem.problem.Problem` is.
+    """Problem that a tuner trains on, as `bench.problem.problem.Problem` is.
 
     Attributes:
-        cube: between bounds and unit cube.
-        scale: (C,) what a residual is divided by.
+        cube: map between bounds and unit cube.
+        scale: (C,) scale of the residuals of each channel.
     """
 
     cube: UnitCube
     scale: Array
 
     def scenarios(self, rng: np.random.Generator) -> tuple[Scenario, ...]:
-        """Those of one target."""
+        """Draw the scenarios of one target."""
 
     def scene(self, scenarios: Sequence[Scenario]) -> Scene:
-        """What tuners are told of them."""
+        """Return the scenario information that tuners get."""
 
     def simulate(self, points: Array, scenarios: tuple[Scenario, ...]) -> Array:
-        """Observations (n, T, C) of points (n, dim) of the unit cube."""
+        """Simulate points of the unit cube.
+
+        Args:
+            points: (n, dim) points of the unit cube.
+            scenarios: runs to simulate.
+
+        Returns:
+            Observations (n, T, C).
+        """
 
 
 class Disturbed(Protocol):
-    """Simulates with what the simulator may lack, as `bench.problem.nuisance.Nuisance` does."""
+    """Simulator with effects that the tuned one lacks, as `bench.problem.nuisance.Nuisance` is."""
 
     def simulate(
         self, rng: np.random.Generator, points: Array, scenarios: tuple[Scenario, ...]
     ) -> Array:
-        """Observations (n, T, C) of points (n, dim) of the unit cube."""
+        """Simulate points of the unit cube with random effects.
+
+        Args:
+            rng: random generator of the effects.
+            points: (n, dim) points of the unit cube.
+            scenarios: runs to simulate.
+
+        Returns:
+            Observations (n, T, C).
+        """
 
 
 class Practice:
-    """The practice ground of learned tuners; see `methods.base.Practice`.
+    """Training simulator of learned tuners; see `methods.base.Practice`.
 
     Args:
-        problem: what is practised on.
-        budget: simulations allowed.
-        nuisance: simulates in its place, for training over effects that the world may have.
+        problem: problem to train on.
+        budget: number of simulations allowed.
+        nuisance: simulator with random effects that is used instead; None for the problem's own.
     """
 
     def __init__(self, problem: Ground, budget: int, nuisance: Disturbed | None = None) -> None:
@@ -61,18 +78,36 @@ class Practice:
         self.scale = problem.scale
         self.used = 0
         self.budget = budget
-        # Any scenario tells how many samples and which numbers there will be.
+        # All scenarios have the same number of samples and inputs, so any scenario gives the sizes.
         scenarios = problem.scenarios(np.random.default_rng(0))
         self.lengths = tuple(scenario.times.size for scenario in scenarios)
         self.scene = problem.scene(scenarios)
 
     def sample(self, rng: np.random.Generator, n: int) -> Array:
-        """(n, dim) parameters drawn uniformly from the training range, unit cube."""
+        """Draw parameters uniformly from the training range.
+
+        Args:
+            rng: random generator.
+            n: number of points.
+
+        Returns:
+            (n, dim) points of the unit cube.
+        """
         return rng.uniform(self.training[0], self.training[1], size=(n, self.dim))
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
-        """Observations (n, T, C) of `points` (n, dim), all in one scenario drawn by `rng`; told by
-        `scene`.
+        """Simulate points, all in one scenario drawn at random; `scene` then describes it.
+
+        Args:
+            rng: random generator.
+            points: (n, dim) points of the unit cube.
+
+        Returns:
+            Observations (n, T, C).
+
+        Raises:
+            ValueError: a point is outside the training range.
+            BudgetExceededError: more simulations are requested than the budget allows.
         """
         points = np.asarray(points, dtype=np.float64)
         low, high = self.training
@@ -80,7 +115,7 @@ class Practice:
             raise ValueError(
                 "a learned tuner may only simulate inside the training range while it trains"
             )
-        # Refused whole: a tuner that asks for too much would else learn from part of it.
+        # The whole request is refused; otherwise the tuner would learn from a part of it.
         asked = self.used + len(points)
         if asked > self.budget:
             raise BudgetExceededError(f"{asked} training simulations asked, {self.budget} allowed")

@@ -1,9 +1,8 @@
-"""An experiment's problem: its simulator, the unit cube of its parameters, the channels observed
-and their scale.
+"""Tuning problem of an experiment: simulator, unit cube, channels and their scale.
 
 `Problem` is rebuilt from the experiment in every process. Targets (`bench.problem.targets`) are
-made in the parent process alone, which keeps their true parameters; learned tuners meet the
-simulator in `bench.problem.practice`.
+made in the parent process alone, which stores their true parameters. Learned tuners access the
+simulator through `bench.problem.practice`.
 """
 
 from __future__ import annotations
@@ -25,26 +24,25 @@ from sims.base import Array, InputError, Scenario, Simulator, UnitCube, adjusted
 
 
 class Problem:
-    """What an experiment tunes; counts what it simulates.
+    """Tuning problem of an experiment; counts its simulations.
 
     Attributes:
-        experiment: as it was read.
-        simulator: the one that is tuned.
-        world: the one that makes the targets; the same where the experiment names no other.
-        cube: between the parameters' bounds and the unit cube.
-        channels: observed, in order.
-        error_channel: index of the one in which errors are reported.
-        noise: (C,) 1 sigma of each channel, 0 where unknown.
-        scale: (C,) what a residual is divided by: the noise, or the typical magnitude of the
-            channel.
-        recording: what the experiment's recording holds; None for simulated targets.
-        salt: what targets are drawn from.
-        simulated: simulations made so far.
+        experiment: configuration of the experiment.
+        simulator: simulator that is tuned.
+        world: simulator that makes the targets; the tuned one unless the experiment names another.
+        cube: map between the parameters' bounds and the unit cube.
+        channels: observed channels, in order.
+        error_channel: index of the channel in which errors are reported.
+        noise: (C,) standard deviation of each channel's noise, 0 if unknown.
+        scale: (C,) divisor of the residuals: the noise, or the typical magnitude of the channel.
+        recording: content of the experiment's recording; None for simulated targets.
+        salt: salt from which targets are drawn.
+        simulated: number of simulations made so far.
 
     Args:
-        experiment: as it was read.
-        salt: the secret one, which only the process has that draws the targets; the experiment's
-            own where None.
+        experiment: configuration of the experiment.
+        salt: secret salt, which only the process that draws the targets has; None for the
+            experiment's own.
     """
 
     def __init__(self, experiment: Experiment, salt: str | None = None) -> None:
@@ -78,10 +76,11 @@ class Problem:
             self._channel(name)
         if experiment.recording:
             self.recording = measured(experiment.recording.path, self.simulator)
-            # What the experiment says stands above what the recording does.
+            # Noise in the experiment file has priority over noise in the recording.
             noise = {**self.recording.noise, **noise}
         self.noise: Array = np.array([noise.get(c.name, 0.0) for c in self.channels])
-        # Channels of different units weigh alike: by their noise, else by their usual size.
+        # Channels with different units are scaled by their noise, or else by their typical
+        # magnitude.
         typical = [c.scale for c in self.channels]
         self.scale: Array = np.where(self.noise > 0, self.noise, typical)
 
@@ -91,12 +90,12 @@ class Problem:
         experiment = self.experiment
         try:
             return kind(constants=experiment.fixed, observe=observe, **settings)
-        except TypeError as error:  # a setting that its constructor does not take
+        except TypeError as error:  # a setting that its constructor does not accept
             who = f"experiment {experiment.name}: simulator {experiment.simulator}"
             raise InputError(f"{who}: {error}") from None
 
     def _check_world(self) -> None:
-        """Refuse a world whose parameters are not the first of the tuned ones."""
+        """Raise an error if the parameters of `world` are not the first of the tuned ones."""
         tuned, made = (
             [parameter.name for parameter in simulator.parameters]
             for simulator in (self.simulator, self.world)
@@ -109,7 +108,7 @@ class Problem:
             )
 
     def _check_constants(self) -> None:
-        """Refuse constants that scenarios would draw and no simulator could have."""
+        """Raise an error for random constants that the simulator does not have or accept."""
         constants = self.experiment.constants.items()
         ranges = {name: ends for name, ends in constants if isinstance(ends, tuple)}
         for end in range(2):
@@ -117,7 +116,7 @@ class Problem:
             self.simulator.run_constants(Scenario(np.zeros(1), constants=drawn))
 
     def close(self) -> None:
-        """Give back what the simulators hold."""
+        """Close the simulators."""
         self.simulator.close()
         self.world.close()
 
@@ -128,50 +127,61 @@ class Problem:
         return names.index(name)
 
     def simulate(self, points: Array, scenarios: tuple[Scenario, ...]) -> Array:
-        """Observations (n, T, C) of unit-cube points (n, dim), the scenarios' samples one after
-        another.
+        """Simulate points of the unit cube.
+
+        Args:
+            points: (n, dim) points of the unit cube.
+            scenarios: runs to simulate.
+
+        Returns:
+            Observations (n, T, C) with the samples of the scenarios concatenated.
         """
         self.simulated += len(points)
         theta = self.cube.physical(points)
-        if len(scenarios) == 1:  # nothing to join, and joining copies
+        if len(scenarios) == 1:  # concatenation would copy the array
             return self.simulator.simulate(theta, scenarios[0])
         return np.concatenate([self.simulator.simulate(theta, s) for s in scenarios], axis=1)
 
     def scenarios(self, rng: np.random.Generator) -> tuple[Scenario, ...]:
-        """The recording's training runs, or one run with initial state and inputs drawn as the
-        experiment says.
-        """
+        """Return the recording's fitted runs, or one run with random initial state and inputs."""
         if self.recording:
             return self.recording.fitting.scenarios
         experiment = self.experiment
         return (targets.scenario(experiment, rng, experiment.initial, experiment.inputs),)
 
     def scene(self, scenarios: Sequence[Scenario]) -> Scene:
-        """What tuners are told; an initial value that a channel shows is the observation's first
-        sample.
+        """Return the scenario information for tuners: initial values, constants and inputs.
+
+        An initial value of an observed channel is left out, because it is the first sample.
         """
         shown = {c.name for c in self.channels}
         initial: list[float] = []
         inputs = []
         for scenario in scenarios:
             hidden = {k: v for k, v in scenario.initial.items() if k not in shown}
-            # By name, so that a network meets the same number in the same place.
+            # Sorted by name, so that each network input always has the same meaning.
             numbers = sorted({**hidden, **scenario.constants}.items())
             initial += [value for _, value in numbers]
             signals = np.array([values for _, values in sorted(scenario.inputs.items())])
-            # A scenario without inputs has T samples of none.
+            # A scenario without inputs has T samples of zero signals.
             inputs.append(signals.reshape(-1, scenario.times.size).T)
         return Scene(np.array(initial, dtype=np.float64), np.concatenate(inputs))
 
     def target(self, kind: str, index: int) -> Target:
-        """Target `index` of range `kind`; it depends on the experiment's name, not on tuners, seeds
-        or budgets.
+        """Draw one target.
+
+        It depends on the experiment's name, but not on tuners, seeds or budgets.
+
+        Args:
+            kind: range of the target.
+            index: number of the target in its range.
         """
         return targets.draw(self, kind, index)
 
     def targets(self) -> list[Target]:
-        """All targets of the experiment; the ranges take turns, so that a part of the work is a
-        part of each.
+        """Draw all targets of the experiment.
+
+        The ranges alternate, so that a part of the targets contains all ranges.
         """
         return [
             self.target(kind, index)
@@ -181,14 +191,17 @@ class Problem:
 
     @property
     def identifiable(self) -> bool:
-        """Whether there is more than one parameter, and so combinations that data may tell or not,
-        and it is asked.
-        """
+        """Whether to compute identifiability: it is requested, and there are several parameters."""
         return self.cube.dim > 1 and self.experiment.identifiability
 
     def spectrum(self, target: Target) -> Spectrum | None:
-        """What the target's data identify, at its truth; of a recording, whose starts share one, at
-        the nominal parameters and with the first start. None where nothing is asked.
+        """Compute the Fisher-information spectrum of a target's data at its true parameters.
+
+        For a recording it is computed at the nominal parameters, and for the first start only,
+        because all starts have the same data.
+
+        Returns:
+            The spectrum; None if it is not requested or computed for another start.
         """
         again = target.truth is None and target.sealed.name != f"{target.sealed.range}-000"
         if again or not self.identifiable:
@@ -198,20 +211,21 @@ class Problem:
         scenarios = target.sealed.fitting.scenarios
 
         def simulate(theta: Array) -> Array:
-            # Beside `self.simulate`: what is asked here is no part of any budget.
+            # This bypasses `self.simulate`, because these simulations are not part of any budget.
             return np.concatenate([self.simulator.simulate(theta, s) for s in scenarios], axis=1)
 
         return spectrum(simulate, at, self.cube.parameters, self.scale)
 
     def outside(self, truth: Array) -> float:
-        """How far `truth` (dim,) lies outside the training range: the largest distance, in
-        training-range widths.
+        """Return the distance of true parameters (dim,) from the training range.
+
+        It is the largest distance of a parameter in units of the training-range width; 0 inside.
         """
         ranges = np.array([p.training_range for p in self.cube.parameters])
-        # One of the two is positive outside, both are negative inside.
+        # One of the two differences is positive outside, both are negative inside.
         beyond = np.maximum(ranges[:, 0] - truth, truth - ranges[:, 1])
         return float(max(0.0, (beyond / self.cube.training_widths()).max()))
 
     def practice(self, budget: int) -> Practice:
-        """The simulator as a learned tuner may use it while training."""
+        """Return the training simulator for a learned tuner."""
         return Practice(self, budget)

@@ -1,6 +1,4 @@
-"""A recording as scenarios and observations: what an experiment on real data fits, and what it
-measures on.
-"""
+"""Convert a recording to scenarios and observations for fitting and for validation."""
 
 from __future__ import annotations
 
@@ -18,8 +16,11 @@ from sims.user_toml import known
 
 
 class Side(NamedTuple):
-    """Runs with what was observed in them: scenarios, one a run, and (T, C) all runs' samples one
-    after another.
+    """Runs of one data split with their observations.
+
+    Attributes:
+        scenarios: one scenario per run.
+        observed: (T, C) samples of all runs, concatenated.
     """
 
     scenarios: tuple[Scenario, ...]
@@ -27,7 +28,13 @@ class Side(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """A recording's two sides, and the noise of each channel where it is stated (1 sigma)."""
+    """Fitted and held-out runs of a recording.
+
+    Attributes:
+        fitting: runs that tuners may fit.
+        held_out: runs for validation.
+        noise: standard deviation of the noise by channel, if specified.
+    """
 
     fitting: Side
     held_out: Side
@@ -35,10 +42,14 @@ class Measured(NamedTuple):
 
 
 def measured(path: str, simulator: Simulator) -> Measured:
-    """The recording at `path` as the simulator's channels see it.
+    """Read a recording with the channels of a simulator.
+
+    Args:
+        path: path of the recording, see `find_recording`.
+        simulator: simulator whose channels are read.
 
     Raises:
-        InputError: it cannot be found or read, or lacks a channel of the simulator.
+        InputError: the recording cannot be found or read, or lacks a channel of the simulator.
     """
     recording = read_recording(find_recording(path), type(simulator))
     wanted = [channel.name for channel in simulator.channels]
@@ -53,18 +64,24 @@ def measured(path: str, simulator: Simulator) -> Measured:
 def _side(recording: Recording, runs: tuple[Run, ...], simulator: Simulator) -> Side:
     names = [channel.name for channel in simulator.channels]
     observed = [np.stack([run.channels[name] for name in names], axis=1) for run in runs]
-    # Where nothing is held out there is nothing to join, and yet channels.
+    # Without runs the array has no rows, but it still needs a column per channel.
     nothing = np.empty((0, len(names)))
     scenarios = tuple(scenario_of(run, simulator, recording.constants) for run in runs)
     return Side(scenarios, np.concatenate([nothing, *observed]))
 
 
 def scenario_of(run: Run, simulator: Simulator, constants: Mapping[str, float]) -> Scenario:
-    """The scenario of a recorded run: it starts in the measured state where the run does not state
-    its own.
+    """Convert a recorded run to a scenario.
+
+    The run starts in the first measured state unless it specifies an initial state.
+
+    Args:
+        run: recorded run.
+        simulator: simulator whose states are initialised.
+        constants: constants of the whole recording.
     """
     first = {name: float(values[0]) for name, values in run.channels.items()}
-    # A channel that is no state, such as an acceleration, says nothing of where the run starts.
+    # A channel that is not a state, such as an acceleration, gives no initial value.
     start = {
         name: value
         for name, value in first.items()
@@ -82,16 +99,21 @@ def scenario_of(run: Run, simulator: Simulator, constants: Mapping[str, float]) 
 
 
 def beside(path: str, experiment: Path) -> str:
-    """The path of an experiment's recording, made absolute where it lies beside the experiment's
-    file: a worker or a folder of results does not know where that was.
+    """Return a recording's path, made absolute if the file is next to the experiment file.
+
+    Workers and result folders do not know the location of the experiment file.
+
+    Args:
+        path: path of the recording in the experiment.
+        experiment: path of the experiment file.
     """
     file = experiment.parent / path
-    # The folders of recordings come first wherever the path is looked up.
+    # The folders of recordings have priority everywhere.
     return path if datasets.find("recording", path) or not file.is_file() else str(file.resolve())
 
 
 def find_recording(path: str) -> Path:
-    """The file `path` below $SIMGAP_DATA or the user's folder of data sets, or as it stands.
+    """Find a recording below $SIMGAP_DATA, in the user's folder of data sets, or as a path.
 
     Raises:
         InputError: it is in none of these places; the message says how to get it.

@@ -1,4 +1,4 @@
-"""The simulator of an experiment: a registered one, or that of a robot's model file."""
+"""Get the simulator of an experiment: a registered one, or one made from a model file."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from sims.registry import SkippedError
 from sims.simulated import Simulated
 
 PACKAGE = "package://"
-"""Begins the place of a model file in an installed Python package, as URDF files write it."""
+"""Prefix of a model file's path in an installed Python package, as in URDF files."""
 
 
 def kind_of(experiment: Experiment) -> type[Simulator]:
-    """The simulator that an experiment tunes.
+    """Return the class of the simulator that an experiment tunes.
 
     Raises:
-        InputError: there is none of that name, or its model file cannot be used.
-        SkippedError: something that it needs is not here.
+        InputError: there is no simulator of that name, or its model file cannot be used.
+        SkippedError: something that it needs is missing on this machine.
     """
     if not experiment.model:
         return simulators.get(experiment.simulator)
@@ -46,8 +46,9 @@ def kind_of(experiment: Experiment) -> type[Simulator]:
 
 
 def completed(experiment: Experiment) -> Experiment:
-    """An experiment on a robot with the channels, commands and initial pose that it leaves out:
-    those of its recording, or the usual ones of the robot.
+    """Complete a robot experiment that does not specify channels, commands and initial pose.
+
+    They are taken from its recording, or from the robot's default recording.
     """
     if not experiment.model:
         return experiment
@@ -66,7 +67,7 @@ def completed(experiment: Experiment) -> Experiment:
 
 
 def missing(experiment: Experiment) -> str:
-    """Why the model file of an experiment is not here; empty where it is, or where it has none."""
+    """Return why an experiment's model file is missing; empty if it exists or is not needed."""
     if not experiment.model:
         return ""
     try:
@@ -77,11 +78,17 @@ def missing(experiment: Experiment) -> str:
 
 
 def find_model(path: str, name: str) -> Path:
-    """The model file of experiment `name`: in an installed package (``package://NAME/FILE``), below
-    $SIMGAP_ROBOTS or the user's folder of data sets, or as it stands.
+    """Find the model file of an experiment.
+
+    It can be in an installed package (``package://NAME/FILE``), below $SIMGAP_ROBOTS, in the user's
+    folder of data sets, or a path.
+
+    Args:
+        path: path of the model file in the experiment.
+        name: name of the experiment, for messages.
 
     Raises:
-        SkippedError: it is in none of these places.
+        SkippedError: the file is in none of these places.
     """
     if path.startswith(PACKAGE):
         return _packaged(path, name)
@@ -101,7 +108,7 @@ def _packaged(path: str, name: str) -> Path:
     if not (package.isidentifier() and inside):
         wanted = f"{PACKAGE}NAME/FILE of an installed package"
         raise InputError(f"experiment {name}: model: expected {wanted}, found '{cut(path)}'")
-    # It is looked for and not imported: what a package does then is none of ours.
+    # The package is located without importing it, so that its code does not run.
     known = importlib.util.find_spec(package)
     if known is None:
         reason = f"needs {package}, not installed (pip install {package.split('_')[0]})"

@@ -1,7 +1,8 @@
-"""What targets are drawn from: a salt that no tuner knows, committed by its hash before the first
-run and revealed after the last.
+"""Secret salt from which targets are drawn.
 
-A public salt (or none) gives the streams of the published experiments, which everybody can draw.
+No tuner knows the salt. Its hash is published before the first run (commitment), and the salt is
+revealed after the last. A public or empty salt gives the random streams of the published
+experiments, which everybody can reproduce.
 """
 
 from __future__ import annotations
@@ -16,27 +17,32 @@ from bench.problem.seeds import rng_for
 from sims.base import InputError
 
 PUBLIC = "public"
-"""The salt of targets that everybody can draw."""
+"""Salt of targets that everybody can reproduce."""
 _HASH = re.compile(r"[0-9a-f]{64}$")
 LONGEST = 1000
-"""Characters of a salt."""
+"""Maximum length of a salt in characters."""
 
 
 def fresh() -> str:
-    """A salt that nobody can guess: 128 random bits."""
+    """Return a new random salt of 128 bits."""
     return secrets.token_hex(16)
 
 
 def commitment(salt: str) -> str:
-    """The SHA-256 of a salt, which says nothing of it and fits no other."""
+    """Return the SHA-256 of a salt, which commits to the salt without revealing it."""
     return hashlib.sha256(salt.encode()).hexdigest()
 
 
 def check_commitment(who: str, salt: str, committed: str) -> None:
-    """Refuse a salt that is not the one that was committed.
+    """Raise an error if a salt does not match its commitment.
+
+    Args:
+        who: name of the experiment, for messages.
+        salt: the salt; may be empty.
+        committed: SHA-256 of the salt; empty if there is no commitment.
 
     Raises:
-        InputError: it is not, or the commitment is none.
+        InputError: the salt is too long, the commitment is not a hash, or both do not match.
     """
     if len(salt) > LONGEST:
         raise InputError(f"{who}: expected a salt of up to {LONGEST} characters, found {len(salt)}")
@@ -52,14 +58,15 @@ def check_commitment(who: str, salt: str, committed: str) -> None:
 
 
 class Streams:
-    """The random streams of one target.
+    """Random streams of one target.
 
-    With a secret salt each thing is drawn from a stream of its own: what a tuner sees of one, such
-    as its start, tells it nothing of another. The public streams are one, as they were published.
+    With a secret salt each quantity is drawn from its own stream. A quantity that a tuner knows,
+    such as its start, therefore gives no information about another one. With a public salt there is
+    one stream for all quantities, as in the published experiments.
 
     Args:
-        salt: of the comparison.
-        names: of the target: experiment, range and number.
+        salt: salt of the comparison.
+        names: names of the target: experiment, range and number.
     """
 
     def __init__(self, salt: str, *names: str | int) -> None:
@@ -69,11 +76,11 @@ class Streams:
         self._one = rng_for(experiment, "target", *which)
 
     def of(self, what: str) -> np.random.Generator:
-        """The stream from which one thing is drawn; public ones go on where the last stopped."""
+        """Return the random generator of one quantity; public salts share one generator for all."""
         return self._one if self._public else self._secret(what)
 
     def held_out(self, scenario: int) -> np.random.Generator:
-        """The stream of an unseen scenario."""
+        """Return the random generator of a held-out scenario."""
         if self._public:
             return rng_for(*self._names, "held-out", scenario)
         return self._secret("held-out", scenario)

@@ -1,4 +1,4 @@
-"""Random streams derived from names, so that the same command gives the same numbers anywhere."""
+"""Random generators derived from names, so that results are reproducible on every machine."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 
 
 def rng_for(*names: str | int) -> np.random.Generator:
-    """The generator that belongs to `names`, the same in every process and on every machine.
+    """Return the random generator of some names, equal in every process and on every machine.
 
-    A caller names what its stream depends on and nothing else: a target's stream has no tuner in
-    it, so all tuners meet the same target.
+    The names are everything that the stream depends on. The stream of a target does not depend on
+    the tuner, for example, so all tuners get the same target.
     """
     return np.random.default_rng(stream_of(*names))
 
 
 def stream_of(*names: str | int) -> NDArray[np.uint32]:
-    """The seed (8,) of the generator that belongs to `names`; see `rng_for`."""
-    # A separator that no name has: ("a", "bc") and ("ab", "c") are different streams.
+    """Return the seed (8,) of the generator of some names; see `rng_for`."""
+    # The separator is in no name, so that ("a", "bc") and ("ab", "c") give different streams.
     text = "\x1f".join(str(name) for name in names)
-    # Python's own hash differs from process to process.
+    # Python's own hash differs between processes.
     digest = hashlib.sha256(text.encode()).digest()
     return np.frombuffer(digest, dtype=np.uint32)

@@ -1,5 +1,6 @@
-"""Input signals by name, for recordings made by simulation: ``sine:2:0.5`` is 2 sin(2 pi 0.5 t),
-and ``0.3 + sine:2:0.5`` about 0.3.
+"""Input signals described by text, for simulated recordings.
+
+``sine:2:0.5`` is 2 sin(2 pi 0.5 t), and ``0.3 + sine:2:0.5`` adds a constant of 0.3.
 """
 
 from __future__ import annotations
@@ -15,18 +16,20 @@ _TAU = 2 * np.pi
 """Radians of one period."""
 
 _MOST_CHANGES = 1e8
-"""Periods or levels of a signal beyond which its frequency is a slip of the pen."""
+"""Maximum number of periods or levels of a signal; a larger number is a typing error."""
 
 _SINES = 6
-"""Of a multisine; their frequencies are even on a logarithmic axis."""
+"""Number of sines of a multisine; their frequencies are evenly spaced on a logarithmic scale."""
 _RISE = 0.5
-"""Of its longest period, until it has its full size."""
+"""Rise time of a multisine's amplitude, in periods of its lowest frequency."""
 _EDGE = 1e-9
-"""Share of a step by which a sample may come early and still belong to the new level: times are
-rounded."""
+"""Tolerance for rounded sample times at a step, as a share of the step's duration.
+
+A sample that is earlier than the step by less than this share belongs to the new level.
+"""
 
 
-# Every form takes the generator, whether it draws from it or not: one call serves all.
+# All functions take the generator, so that they can be called in the same way.
 
 
 def _constant(t: Array, rng: np.random.Generator, value: float) -> Array:  # noqa: ARG001
@@ -67,7 +70,7 @@ def _chirp(
     low: float,
     high: float,
 ) -> Array:
-    # The phase is the integral of a frequency that grows in proportion to time.
+    # The phase is the integral of a frequency that increases linearly with time.
     periods = low * t + (high - low) * t * t / (2 * t[-1])
     signal: Array = amplitude * np.sin(_TAU * periods)
     return signal
@@ -79,7 +82,7 @@ def _multisine(
     frequencies = np.geomspace(low, high, _SINES)
     phases = rng.uniform(0.0, _TAU, _SINES)
     total = np.sin(_TAU * frequencies * t[:, None] + phases).sum(axis=1)
-    # From rest: a servo that is to leap has its largest error before anything has been told.
+    # It starts at zero, because a sudden start would make the largest error of a servo at t = 0.
     rise = np.minimum(t * low / _RISE, 1.0)
     largest = float(np.abs(rise * total).max())
     faded: Array = amplitude * rise * total / max(largest, 1e-12)
@@ -94,22 +97,30 @@ _FORMS: dict[str, tuple[Callable[..., Array], str]] = {
     "chirp": (_chirp, "AMPLITUDE:HERTZ:HERTZ"),
     "multisine": (_multisine, "AMPLITUDE:HERTZ:HERTZ"),
 }
-"""Each form by name: what computes it, and the numbers that it takes."""
+"""Function and argument names of each form of signal, by name."""
 
 HELP = ", ".join(f"{name}:{form}" for name, (_, form) in _FORMS.items())
-"""The forms there are, for a help text."""
+"""List of the forms of signals for a help text."""
 
 
 def signal(text: str, times: Array, rng: np.random.Generator) -> Array:
-    """The values (T,) at `times` (T,) of the signal that `text` describes; a plain number is
-    constant, and signals with `` + `` between are added.
+    """Compute the values of the signal that a text describes.
 
-    `steps` holds levels drawn by `rng` evenly within the amplitude, `chirp` sweeps from one
-    frequency to the other, `multisine` is a sum of sines from one to the other with phases drawn by
-    `rng`, that begins at zero and reaches the amplitude.
+    A plain number is constant, and signals separated by `` + `` are added. `steps` holds random
+    levels, uniform within the amplitude. `chirp` sweeps from one frequency to the other.
+    `multisine` is a sum of sines between two frequencies with random phases; it starts at zero and
+    reaches the amplitude.
+
+    Args:
+        text: description of the signal.
+        times: (T,) sample times in seconds.
+        rng: random generator of levels and phases.
+
+    Returns:
+        (T,) values.
 
     Raises:
-        InputError: no such form, or not its numbers.
+        InputError: there is no such form, or its numbers are not valid.
     """
     first, *others = text.split(" + ")
     result = _one(first.strip(), times, rng)
@@ -119,7 +130,7 @@ def signal(text: str, times: Array, rng: np.random.Generator) -> Array:
 
 
 def _one(text: str, times: Array, rng: np.random.Generator) -> Array:
-    """The values of a signal that is no sum."""
+    """Compute the values of one signal without sums."""
     name, *given = text.split(":")
     if not given:
         name, given = "constant", [text]
@@ -131,7 +142,7 @@ def _one(text: str, times: Array, rng: np.random.Generator) -> Array:
     except ValueError:
         numbers = []
     complete = len(numbers) == len(form.split(":")) and np.isfinite(numbers).all()
-    # All behind the first are frequencies or durations.
+    # All numbers except the first are frequencies or durations.
     if not complete or min([1.0, *numbers[1:]]) <= 0:
         wanted = f"{name}:{form} with numbers, all but the first > 0"
         raise InputError(f"signal '{cut(text)}': expected {wanted}")

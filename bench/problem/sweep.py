@@ -1,4 +1,4 @@
-"""One experiment file for several experiments: lists of values that it sweeps over."""
+"""Expand an experiment file that sweeps over lists of values."""
 
 from __future__ import annotations
 
@@ -14,26 +14,30 @@ from sims.base import InputError
 from sims.user_toml import fault
 
 _UNFIT = re.compile(r"[^\w.+-]+")
-"""What a folder's name, and a command line without quotes, could not hold."""
+"""Characters that are not valid in folder names and in command lines without quotes."""
 MOST = 10_000
-"""Experiments of one file; each has a folder of its own, and all are checked before the first."""
+"""Maximum number of experiments of one file.
+
+Each one has its own folder, and all are checked before the first run.
+"""
 
 
 def documents(
     path: Path, document: Mapping[str, Any], swept: Mapping[str, Sequence[Any]]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every combination of the values, the last key's changing fastest.
+    """Iterate over all combinations of the values; those of the last key change fastest.
 
     Args:
-        path: of the file, for messages.
-        document: the experiment's tables without a sweep.
+        path: experiment file, for messages.
+        document: tables of the experiment without a sweep.
         swept: values by key; a key within a table is joined by dots.
 
     Yields:
-        The label, as ``budget=10,noise.x=0.1``, and the tables with these values in their places.
+        The label, as ``budget=10,noise.x=0.1``, and the tables with these values inserted.
 
     Raises:
-        InputError: a key without values, or values that one label would stand for.
+        InputError: a key has no values, two values have the same label, or there are too many
+            combinations.
     """
     count = prod(len(values) for values in swept.values())
     if count > MOST:
@@ -44,7 +48,7 @@ def documents(
     for key, values in swept.items():
         _check(path, f"sweep.{key}", values)
     for values in product(*swept.values()):
-        # Tables within the document are changed, and every combination begins with the file's.
+        # A copy is needed, because tables within the document are changed.
         changed = deepcopy(dict(document))
         parts = []
         for key, value in zip(swept, values, strict=True):
@@ -63,7 +67,7 @@ def _check(path: Path, where: str, values: Sequence[Any]) -> None:
 
 
 def _text(path: Path, where: str, value: Any) -> str:
-    """A value as it stands in a label."""
+    """Return a value as text for a label."""
     if isinstance(value, dict):
         raise fault(path, where, "texts, numbers, bools or lists of them", value)
     if isinstance(value, list | tuple):
@@ -74,7 +78,7 @@ def _text(path: Path, where: str, value: Any) -> str:
 
 
 def _put(path: Path, document: dict[str, Any], key: str, value: Any) -> None:
-    """Put a value in the place that a key joined by dots names."""
+    """Insert a value at the position that a key joined by dots names."""
     table, rest = document, key
     while (name := _first(table, rest)) != rest:
         table, rest = table.setdefault(name, {}), rest[len(name) + 1 :]
@@ -84,7 +88,7 @@ def _put(path: Path, document: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _first(table: Mapping[str, Any], key: str) -> str:
-    """The part of a key that names an entry of the table; effects have names with dots in them."""
+    """Return the part of a key that names an entry of the table; effect names can contain dots."""
     there = [name for name in table if key == name or key.startswith(f"{name}.")]
-    # What is not there is a table to be made, or a key that the checks will refuse.
+    # A part that is not in the table is a new table, or a key that later checks refuse.
     return max(there, key=len, default=key.partition(".")[0])

@@ -1,7 +1,7 @@
-"""Targets: scenarios and observations whose true parameters are sealed from the tuners.
+"""Draw targets: scenarios and observations whose true parameters are hidden from the tuners.
 
-A target's numbers are drawn from streams of its own (`bench.problem.salt`), in a fixed order: start
-and truth, initial state, inputs, constants, sensor noise. Whatever is drawn in another order is
+A target's numbers are drawn from its own random streams (`bench.problem.salt`), in a fixed order:
+start and true parameters, initial state, inputs, constants, sensor noise. Another order gives
 another target.
 
 A target whose own simulation diverges cannot be used to compare tuners. The whole target is drawn
@@ -24,27 +24,31 @@ from bench.problem.signals import signal
 from sims.base import Array, Channel, InputError, Scenario, Simulator, UnitCube
 
 _CUBE = np.array([[0.0], [1.0]])
-"""Corners of the unit cube, in as many dimensions as there are."""
+"""Opposite corners of the unit cube, for any dimension."""
 DIVERGENCE_LIMIT = 1e12
-"""Largest magnitude of a sample, in units of its channel's typical magnitude: beyond it a
-simulation counts as diverged although its numbers are finite.
+"""Largest magnitude of a sample, in units of its channel's typical magnitude.
+
+A simulation with larger samples counts as diverged although its numbers are finite.
 """
 MAX_DRAWS = 200
 """Maximum number of draws of one target."""
 MAX_FAILED_SHARE = 0.9
-"""Largest share of draws that may diverge: the rest would not be a sample of the ranges."""
+"""Largest share of draws that may diverge.
+
+With a larger share the other draws would not be a representative sample of the ranges.
+"""
 
 
 @dataclass(frozen=True)
 class SealedTarget:
-    """A target without its truth, as a worker process gets it.
+    """Target without its true parameters, as worker processes get it.
 
     Attributes:
-        name: e.g. ``wide-017``.
+        name: name, for example ``wide-017``.
         range: in, wide or real.
-        start: (dim,) where tuners start, unit cube.
-        fitting: what the tuner may see.
-        held_out: what only measures; without runs where nothing is held out.
+        start: (dim,) starting point of the tuners in the unit cube.
+        fitting: runs that the tuner may use.
+        held_out: runs for validation; empty if no runs are held out.
     """
 
     name: str
@@ -56,13 +60,12 @@ class SealedTarget:
 
 @dataclass(frozen=True)
 class Target:
-    """A sealed target and, in the parent process only, its true parameters (dim,), physical; None
-    where unknown.
+    """Target with its true parameters; exists in the parent process only.
 
     Attributes:
-        sealed: what a worker process gets.
-        truth: (dim,) the true parameters.
-        redraws: draws that were discarded because their simulation diverged.
+        sealed: part of the target that worker processes get.
+        truth: (dim,) true parameters in physical units; None if they are unknown.
+        redraws: number of draws that were discarded because their simulation diverged.
     """
 
     sealed: SealedTarget
@@ -71,11 +74,11 @@ class Target:
 
 
 class Redraws(NamedTuple):
-    """How many targets had to be drawn again.
+    """Number of targets that were drawn again.
 
     Attributes:
-        redrawn: targets whose first draw diverged.
-        draws: draws of all targets together.
+        redrawn: number of targets whose first draw diverged.
+        draws: number of draws of all targets together.
     """
 
     redrawn: int
@@ -83,16 +86,16 @@ class Redraws(NamedTuple):
 
 
 class Drawing(Protocol):
-    """What targets are drawn of, as `bench.problem.problem.Problem` is.
+    """Problem from which targets are drawn, as `bench.problem.problem.Problem` is.
 
     Attributes:
-        experiment: as it was read.
-        world: the simulator that makes the targets.
-        cube: between bounds and unit cube.
-        channels: observed, in order.
-        noise: (C,) 1 sigma of each channel.
-        recording: what the experiment's recording holds; None for simulated targets.
-        salt: what targets are drawn from.
+        experiment: configuration of the experiment.
+        world: simulator that makes the targets.
+        cube: map between bounds and unit cube.
+        channels: observed channels, in order.
+        noise: (C,) standard deviation of each channel's noise.
+        recording: content of the experiment's recording; None for simulated targets.
+        salt: salt from which targets are drawn.
     """
 
     experiment: Experiment
@@ -104,13 +107,18 @@ class Drawing(Protocol):
     recording: Measured | None
 
     def scenarios(self, rng: np.random.Generator) -> tuple[Scenario, ...]:
-        """Those of one target."""
+        """Draw the scenarios of one target."""
 
 
 def draw(problem: Drawing, kind: str, index: int) -> Target:
-    """Draw target `index` of range `kind`, again where its simulation diverges.
+    """Draw one target, again if its simulation diverges.
 
-    It depends on the experiment's name, not on tuners, seeds or budgets.
+    It depends on the experiment's name, but not on tuners, seeds or budgets.
+
+    Args:
+        problem: problem of the experiment.
+        kind: range of the target.
+        index: number of the target in its range.
 
     Raises:
         InputError: all of `MAX_DRAWS` draws diverge.
@@ -125,8 +133,12 @@ def draw(problem: Drawing, kind: str, index: int) -> Target:
 def redraws_of(experiment: Experiment, drawn: Sequence[Target]) -> Redraws:
     """Count the draws of all targets.
 
+    Args:
+        experiment: configuration of the experiment.
+        drawn: all targets.
+
     Raises:
-        InputError: more than `MAX_FAILED_SHARE` of them diverged.
+        InputError: more than `MAX_FAILED_SHARE` of the draws diverged.
     """
     failed = sum(target.redraws for target in drawn)
     draws = failed + len(drawn)
@@ -145,8 +157,8 @@ def _diverging(experiment: Experiment, failed: int, draws: int) -> InputError:
 
 
 def _draw(problem: Drawing, kind: str, index: int, number: int) -> Target | None:
-    """Make one draw; None where the simulation diverges."""
-    # No tuner, seed or budget in the stream's name: all tuners meet the same target.
+    """Make one draw; None if the simulation diverges."""
+    # The stream's name contains no tuner, seed or budget, so that all tuners get the same target.
     met = problem.experiment.same_targets_as or problem.experiment.name
     again = ("redraw", number) if number else ()
     streams = Streams(problem.salt, met, kind, index, *again)
@@ -161,8 +173,8 @@ def _draw(problem: Drawing, kind: str, index: int, number: int) -> Target | None
         return Target(SealedTarget(name, kind, start, recording.fitting, recording.held_out), None)
     scenarios = problem.scenarios(
         streams.of("scenario")
-    )  # a single one: several runs come from recordings
-    # The world's own parameters are the first of those that are tuned.
+    )  # one scenario, because only recordings have several runs
+    # The parameters of `world` are the first of the tuned ones.
     theta = problem.cube.physical(truth[None])[:, : len(problem.world.parameters)]
     clean = problem.world.simulate(theta, scenarios[0])[0]
     observed = clean + problem.noise * streams.of("noise").standard_normal(clean.shape)
@@ -175,8 +187,10 @@ def _draw(problem: Drawing, kind: str, index: int, number: int) -> Target | None
 
 
 def _diverges(observed: Array, channels: Sequence[Channel]) -> bool:
-    """Whether a simulation (T, C) failed: a sample is infinite or beyond `DIVERGENCE_LIMIT`, or a
-    channel has no sample. Single missing samples (NaN), as of a camera, are no failure.
+    """Return whether a simulation (T, C) failed.
+
+    It failed if a sample is infinite or beyond `DIVERGENCE_LIMIT`, or if a channel has no sample.
+    Single missing samples (NaN), as of a camera, are not a failure.
     """
     if not len(observed):
         return False
@@ -190,19 +204,19 @@ def scenario(
     initial: Mapping[str, Drawn],
     inputs: Mapping[str, str],
 ) -> Scenario:
-    """One run as the experiment samples it.
+    """Draw one run of an experiment.
 
     Args:
-        experiment: has the sampling and the constants.
-        rng: draws what is given as a range.
+        experiment: configuration with the sampling and the constants.
+        rng: random generator for values that are given as a range.
         initial: initial state.
-        inputs: texts of signals.
+        inputs: descriptions of the input signals.
     """
     sampling = experiment.sampling
     start = {name: _drawn(rng, value) for name, value in initial.items()}
     times = np.arange(sampling.samples) / sampling.rate
     signals = {name: signal(text, times, rng) for name, text in inputs.items()}
-    # Those that are the same in every scenario are the simulator's own.
+    # Constants that are equal in every scenario are set in the simulator.
     ranges = {name: v for name, v in experiment.constants.items() if isinstance(v, tuple)}
     constants = {name: _drawn(rng, value) for name, value in ranges.items()}
     return Scenario(times, start, signals, constants)
@@ -213,20 +227,19 @@ def _drawn(rng: np.random.Generator, value: Drawn) -> float:
 
 
 def _held_out(problem: Drawing, theta: Array, target: Streams) -> Side:
-    """Unseen scenarios, and what the target's world does in them, without sensor noise: what is to
-    be predicted.
+    """Simulate the held-out scenarios of a target, without sensor noise.
 
     Args:
-        problem: the experiment's.
-        theta: (1, p) the target's parameters.
-        target: its streams, on which the scenarios depend and on nothing else.
+        problem: problem of the experiment.
+        theta: (1, p) parameters of the target.
+        target: random streams of the target; the scenarios depend on nothing else.
     """
     experiment, wanted = problem.experiment, problem.experiment.held_out
     if wanted is None:
         return Side((), np.empty((0, len(problem.channels))))
     initial = {**experiment.initial, **wanted.initial}
     inputs = {**experiment.inputs, **wanted.inputs}
-    # A stream for each: more of them leave the first as they are.
+    # Each scenario has its own stream, so that more scenarios do not change the first ones.
     streams = [target.held_out(i) for i in range(wanted.scenarios)]
     scenarios = tuple(scenario(experiment, rng, initial, inputs) for rng in streams)
     observed = [problem.world.simulate(theta, each)[0] for each in scenarios]

@@ -1,4 +1,4 @@
-"""How every study begins: in a folder of its own, with a salt, under seals."""
+"""Create a study: its free result folder, its salt, and its isolation layers."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from bench.store.secret import salted
 
 
 class Begun(NamedTuple):
-    """A study whose folder is not written yet: a fault of the user's leaves nothing behind.
+    """Study whose folder is not yet written, so that a user error leaves no files behind.
 
     Attributes:
-        folder: where it will lie.
-        experiment: as it will be made.
-        secret: the salt, where nobody is to know it; None where it is public.
-        jobs: worker processes.
+        folder: result folder to create.
+        experiment: configuration that will be run.
+        secret: secret salt; None if the salt is public.
+        jobs: number of worker processes.
     """
 
     folder: Path
@@ -31,12 +31,12 @@ class Begun(NamedTuple):
     def write(
         self, plugins: Sequence[str], hashes: Mapping[str, str], redraws: Redraws | None = None
     ) -> Path:
-        """Write its folder, and return it.
+        """Create the result folder and return it.
 
         Args:
-            plugins: plugin files that it needs.
-            hashes: of what must not change while it is made.
-            redraws: how many targets were drawn again, for environment.json.
+            plugins: plugin files that the study needs.
+            hashes: hashes of everything that must not change while the study runs.
+            redraws: number of targets that were drawn again, for environment.json.
         """
         held = () if self.experiment.trusted else seals()
         configuration = Configuration(self.experiment, list(plugins), dict(hashes))
@@ -45,8 +45,15 @@ class Begun(NamedTuple):
 
 
 def begun(experiment: Experiment, folder: Path | None, jobs: int, salt: str | None) -> Begun:
-    """A free folder, and the experiment with its salt; see `bench.study.Study.begin`."""
+    """Choose a free folder and the salt of a study; see `bench.study.Study.begin`.
+
+    Args:
+        experiment: configuration of the study.
+        folder: result folder; None for a default name.
+        jobs: number of worker processes; 0 for this process.
+        salt: given salt; None for the experiment's or a new one.
+    """
     place = free_folder(experiment, folder)
     experiment, secret = salted(experiment, salt)
-    # Nothing is out of reach of what works in this process.
+    # Without worker processes tuners run in this process, without isolation.
     return Begun(place, experiment.chosen(trusted=experiment.trusted or not jobs), secret, jobs)

@@ -1,6 +1,4 @@
-"""Worker processes in fresh interpreters: they do not import the user's script, and no Ctrl-C
-reaches them before they have said that it is the parent's to answer.
-"""
+"""Spawn worker processes that do not import the user's script and are shielded from Ctrl-C."""
 
 from __future__ import annotations
 
@@ -14,28 +12,28 @@ from typing import Any
 
 
 class WorkerProcess(SpawnProcess):
-    """A spawned process that does not import the parent's main module, and that starts with
-    interrupts held back until it calls `ignore_interrupts`.
+    """Spawned process that skips the parent's main module and starts with interrupts blocked.
 
-    A worker needs nothing of the main module: plugins are loaded by their files. Without this,
-    multiprocessing would run a script that has no ``if __name__ == "__main__"`` again in each
-    worker.
+    A worker does not need the main module, because plugins are loaded from their files. With
+    multiprocessing's default, a script without ``if __name__ == "__main__"`` would run again in
+    each worker.
 
-    A terminal's Ctrl-C reaches every process of the group. A process that is still importing would
-    end with a traceback in the midst of the table.
+    Ctrl-C in a terminal reaches every process of the group. A process that is still importing would
+    end with a traceback in the middle of the printed table. Interrupts are therefore blocked until
+    the process calls `ignore_interrupts`.
     """
 
     def start(self) -> None:
-        """Start it."""
-        # The resource tracker lets interrupts through again once it has started its own process,
-        # so it must be running before they are held back.
+        """Start the process."""
+        # The resource tracker unblocks interrupts after it has started its own process, so it must
+        # be running before they are blocked.
         resource_tracker.ensure_running()
         with _interrupts_held_back(), _main_module_left_out():
             super().start()
 
 
 class WorkerContext(SpawnContext):
-    """multiprocessing's spawn context with `WorkerProcess` as its process."""
+    """Spawn context of multiprocessing with `WorkerProcess` as its process class."""
 
     Process = WorkerProcess
 
@@ -43,12 +41,12 @@ class WorkerContext(SpawnContext):
 _MAIN_MODULE_KEYS = ("init_main_from_name", "init_main_from_path")
 """Keys of multiprocessing's preparation data that make a child import the main module."""
 _preparing = threading.RLock()
-"""Held while `spawn.get_preparation_data` is replaced."""
+"""Lock that protects the replacement of `spawn.get_preparation_data`."""
 
 
 @contextmanager
 def _main_module_left_out() -> Iterator[None]:
-    """Within the block, processes that this thread spawns do not import the main module.
+    """Prevent processes that this thread spawns from importing the main module.
 
     multiprocessing has no option for this. The preparation data is made inside ``Popen._launch``,
     so the function that makes it is replaced for the calls of this thread.
@@ -72,8 +70,8 @@ def _main_module_left_out() -> Iterator[None]:
 
 @contextmanager
 def _interrupts_held_back() -> Iterator[None]:
-    """Within the block SIGINT waits for this thread; what it starts inherits that."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows, where a new process is of no group
+    """Block SIGINT in this thread; processes started in the block inherit the mask."""
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows a new process is in no process group
         yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -84,8 +82,8 @@ def _interrupts_held_back() -> Iterator[None]:
 
 
 def ignore_interrupts() -> None:
-    """Leave interrupts to the parent: those that waited, and all that come."""
+    """Ignore pending and future interrupts; the parent process handles them."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
-        # What this process starts inherits the mask, and may well want to be interrupted.
+        # Child processes inherit the signal mask, and may need to be interruptible.
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -1,11 +1,10 @@
-"""Makes runs on a Dask cluster: each in a process of its own on the worker's machine, as
-`bench.runs.pools` makes them here.
+"""Run calls on a Dask cluster, each one in an isolated process on the worker's machine.
 
-A cluster's worker is never asked to run a method itself: it keeps one isolated process and hands
-the run on, so that a method that hangs, dies or fills memory costs its own run and no worker. A
-worker that is lost costs nothing: what it was at is sent to another. Plugin files and trained
-weights travel with the calls; recordings and environment variables (SIMGAP_DATA) must be there on
-the workers' machines.
+`bench.runs.pools` does the same on this machine. A worker of the cluster never runs a tuner itself.
+It has one isolated process and passes the call on, so that a tuner that hangs, dies or fills memory
+fails its own run and does not stop the worker. If a worker is lost, its calls are sent to another
+worker. Plugin files and trained weights are sent with the calls. Recordings and environment
+variables (SIMGAP_DATA) must exist on the workers' machines.
 """
 
 from __future__ import annotations
@@ -28,39 +27,49 @@ from sims.base import InputError
 from sims.files import first_line, write
 
 _PATIENCE = 20.0
-"""Seconds without a scheduler after which it counts as lost."""
+"""Seconds without an answer after which the scheduler counts as lost."""
 _AHEAD = 3
-"""Calls for each thread of the cluster that are under way; so many results wait here at most."""
+"""Number of calls in progress per thread of the cluster.
+
+It also limits the number of results that wait in this process.
+"""
 _ASKED = 3
-"""How often workers are asked for their code where some are lost meanwhile."""
+"""Maximum number of attempts to compare the workers' code if workers are lost meanwhile."""
 _LOSSES = 20
-"""Workers that one call may lose before the cluster is taken to be the cause."""
+"""Maximum number of workers that one call may lose before the pool is given up."""
 
 Files = tuple[tuple[str, bytes], ...]
-"""Name and content of files."""
+"""Names and contents of files."""
 Luggage = tuple[tuple[Plugin, bytes], ...]
-"""Plugins and the contents of their files; of an installed one there is none."""
+"""Plugins and the contents of their files; the content is empty for an installed plugin."""
 
 
 @runtime_checkable
 class Travelling(Protocol):
-    """An argument of a call that names files, which must be there where the call is made."""
+    """Argument of a call that refers to files, which must exist where the call is executed."""
 
     def files(self) -> Sequence[Path]:
-        """The files, of different names."""
+        """Return the paths of the files, which must have different names."""
         ...
 
     def moved(self, places: Mapping[Path, Path]) -> Travelling:
-        """The argument where its files have other places."""
+        """Return a copy that refers to other paths.
+
+        Args:
+            places: new path of each file by its present path.
+        """
         ...
 
 
 class ClusterPool:
-    """The cluster with the scheduler at `address`, e.g. ``tcp://10.0.0.5:8786``.
+    """Pool of the workers of a Dask cluster.
+
+    Args:
+        address: address of the scheduler, for example ``tcp://10.0.0.5:8786``.
 
     Raises:
-        InputError: the package is not installed, nobody answers, or the workers have other code
-            than this process.
+        InputError: the package is not installed, no scheduler answers, or the workers have other
+            code than this process.
     """
 
     def __init__(self, address: str) -> None:
@@ -70,7 +79,7 @@ class ClusterPool:
             raise InputError(
                 'a cluster needs the package distributed (pip install -e ".[cluster]")'
             ) from None
-        # What is lost is said here, in one line.
+        # Dask's own log messages are suppressed; this class reports losses in one line.
         for name in [*logging.root.manager.loggerDict, "asyncio"]:
             if name.split(".")[0] in ("distributed", "tornado", "asyncio"):
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
@@ -95,7 +104,7 @@ class ClusterPool:
         here = (rooms(), versions())
         try:
             there = self._identities()
-        except Exception as error:  # whatever a worker without our modules makes of the call
+        except Exception as error:  # any error of a worker that lacks our modules
             raise InputError(
                 f"{self.address}: its workers lack simgap ({first_line(error)})"
             ) from None
@@ -107,14 +116,14 @@ class ClusterPool:
             )
 
     def _identities(self) -> dict[str, Any]:
-        """What each worker says of its code.
+        """Return hashes of code and package versions by worker.
 
         Raises:
-            Exception: one could not say anything.
+            Exception: a worker failed to compute them.
         """
         for _ in range(_ASKED):
             there: dict[str, Any] = self._client.run(_identity, on_error="return")
-            # A worker that is lost while it is asked says nothing about its code.
+            # A worker that is lost during the call gives no information about its code.
             if not any(isinstance(answer, OSError) for answer in there.values()):
                 break
         answers = {w: answer for w, answer in there.items() if not isinstance(answer, OSError)}
@@ -124,7 +133,7 @@ class ClusterPool:
         return answers
 
     def load(self, plugins: Sequence[Plugin]) -> None:
-        """Make these plugins known to the workers; before the first call."""
+        """Register plugins for the workers; must be called before the first call."""
         self._plugins = tuple((p, Path(p.path).read_bytes() if p.path else b"") for p in plugins)
 
     def __enter__(self) -> ClusterPool:
@@ -132,20 +141,28 @@ class ClusterPool:
 
     def __exit__(self, *_: object) -> None:
         closing = threading.Thread(target=self._client.close, kwargs={"timeout": 5}, daemon=True)
-        closing.start()  # in a thread: closing waits long for a scheduler that is gone
+        closing.start()  # in a thread, because closing waits long for a lost scheduler
         closing.join(timeout=10)
 
     def results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
-        """Place and result (or exception) of each call, as they end; see
-        `bench.runs.pools.LocalPool`.
+        """Iterate over the results of calls in the order in which they end.
+
+        See `bench.runs.pools.LocalPool`.
+
+        Args:
+            calls: functions with their arguments.
+            seconds: soft time limit of one call.
+
+        Yields:
+            Index of the call, and its result or exception.
 
         Raises:
-            LostError: the scheduler is gone; what had no end by then is not made.
+            LostError: the scheduler is lost; calls that have not ended are not executed.
         """
         from distributed import CancelledError, KilledWorker
 
         waiting: dict[Any, int] = {}
-        # How many workers each call has lost, and the calls that are to be made again.
+        # The number of workers that each call has lost, and the calls to be executed again.
         losses: dict[int, int] = {}
         following = iter(range(len(calls)))
         again: list[int] = []
@@ -164,7 +181,7 @@ class ClusterPool:
                     ended = future.status
                     error = future.exception() if ended in ("error", "cancelled") else None
                     killed = isinstance(error, KilledWorker | CancelledError)
-                    # A worker that is lost says nothing about the call it was at.
+                    # The loss of a worker gives no information about the call.
                     if killed or ended in ("lost", "cancelled"):
                         losses[place] = losses.get(place, 0) + 1
                         if losses[place] > _LOSSES:
@@ -174,7 +191,7 @@ class ClusterPool:
                         again.append(place)
                         continue
                     result = error if error is not None else self._received(future.result())
-                    # Results stay on the cluster for as long as somebody holds their future.
+                    # The cluster stores a result until its future is released.
                     future.release()
                     yield place, result
         except (OSError, TimeoutError, CancelledError) as error:
@@ -183,8 +200,9 @@ class ClusterPool:
             ) from None
 
     def _done(self, futures: list[Any]) -> list[Any]:
-        """The futures that are done, at least one of them; asks now and then whether the scheduler
-        is still there.
+        """Wait until at least one future is done, and return all that are.
+
+        It checks regularly whether the scheduler still answers.
         """
         from distributed import CancelledError, wait
 
@@ -192,7 +210,7 @@ class ClusterPool:
             try:
                 with self._client.as_current():
                     wait(futures, timeout=2.0, return_when="FIRST_COMPLETED")
-            # A cancelled one is done, and made again if the scheduler lives.
+            # A cancelled future is done; its call is repeated if the scheduler is still running.
             except (TimeoutError, CancelledError):
                 self._there()
             if done := [future for future in futures if future.done()]:
@@ -200,7 +218,7 @@ class ClusterPool:
                 return done
 
     def _there(self) -> None:
-        """Raise unless the scheduler answers within a while."""
+        """Raise an error unless the scheduler answers within `_PATIENCE`."""
         if self._client.status != "running":
             raise OSError(f"connection {self._client.status}")
         self._client.sync(self._client.scheduler.identity, callback_timeout=_PATIENCE)
@@ -215,10 +233,10 @@ class ClusterPool:
         )
 
     def _sent(self, path: Path) -> Any:
-        """The name and content of a file, held by the cluster once, whoever needs it.
+        """Send name and content of a file to the cluster, once for all calls.
 
-        A task gives it, since scattered data are gone with the worker that held them, and a task is
-        made again.
+        It is stored as the result of a task: scattered data would be lost with the worker that
+        stores them, whereas a task is executed again.
         """
         if path not in self._sent_files:
             content = (path.name, path.read_bytes())
@@ -226,7 +244,7 @@ class ClusterPool:
         return self._sent_files[path]
 
     def _received(self, result: Any) -> Any:
-        """What a worker sent; trained weights are put into this machine's cache."""
+        """Return the value of a worker's result; trained weights are written to the local cache."""
         kind, value, content = result
         if kind == "weights":
             path = folder() / value.path.name
@@ -236,7 +254,7 @@ class ClusterPool:
 
 
 def _keep(path: Path, content: bytes) -> None:
-    """Write a file that is not there yet, whole or not at all."""
+    """Write a file atomically if it does not exist."""
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path, content)
@@ -247,7 +265,7 @@ def _itself(content: tuple[str, bytes]) -> tuple[str, bytes]:
 
 
 def _identity() -> tuple[str, str]:
-    """Hashes of the code and the package versions of a worker."""
+    """Return hashes of a worker's code and package versions."""
     return rooms(), versions()
 
 
@@ -262,22 +280,22 @@ def on_worker(
     paths: Sequence[Path],
     contents: Sequence[tuple[str, bytes]],
 ) -> tuple[str, Any, bytes]:
-    """Runs on a cluster's worker: makes the call in an isolated process of this machine.
+    """Execute a call in an isolated process of this machine; runs on a worker of the cluster.
 
     Args:
-        function: what to call.
-        arguments: of the call; files that they name lie on the machine that asks.
-        seconds: soft limit of the call.
-        plugins: that the process loads or knows of, and their files' contents.
-        paths: places of the files there.
-        contents: their names and contents, in the same order.
+        function: function to call.
+        arguments: arguments of the call; paths in them refer to the client's machine.
+        seconds: soft time limit of the call.
+        plugins: plugins that the process loads or registers, and the contents of their files.
+        paths: paths of the files on the client's machine.
+        contents: names and contents of these files, in the same order.
 
     Returns:
-        What the call gave ("value") or the error that ended it, or a training and the content of
-        its file ("weights").
+        Kind, value and content: the result of the call or the error that ended it ("value"), or a
+        training with the content of its weights file ("weights").
     """
     if paths:
-        # In one folder: a recording's description is looked for beside its table.
+        # All files are in one folder, because a recording's description must be next to its table.
         folder_here = _unpacked(tuple(contents))
         places = {path: folder_here / name for path, (name, _) in zip(paths, contents, strict=True)}
         arguments = tuple(
@@ -286,11 +304,11 @@ def on_worker(
         )
     key = (threading.get_ident(), repr(plugins))
     if key not in _pools:
-        # Dask's workers are daemons, which may not have children for fear that these outlive them;
-        # ours do not.
+        # Dask's workers are daemonic processes, which may not have children because these could
+        # outlive them. The processes of this pool end with their parent.
         multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
         _pools[key] = LocalPool(1)
-        # Each in a folder of its own, so that a file is the same whatever else there is.
+        # Each plugin has its own folder, so that its path does not depend on other plugins.
         _pools[key].load([_here(plugin, content) for plugin, content in plugins])
     ((_, result),) = _pools[key].results([(function, arguments)], seconds)
     if function is train and isinstance(result, Training):
@@ -299,7 +317,7 @@ def on_worker(
 
 
 def _here(plugin: Plugin, content: bytes) -> Plugin:
-    """The plugin with its file on this machine."""
+    """Return the plugin with its file on this machine."""
     if not plugin.path:
         return plugin
     name = Path(plugin.path).name
@@ -307,7 +325,7 @@ def _here(plugin: Plugin, content: bytes) -> Plugin:
 
 
 def _unpacked(files: Files) -> Path:
-    """A folder on this machine that holds these files under their own names."""
+    """Write files into a folder of this machine that is named by their hash; return the folder."""
     hashed = hashlib.sha256()
     for name, content in files:
         hashed.update(name.encode() + hashlib.sha256(content).digest())

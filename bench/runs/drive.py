@@ -1,7 +1,8 @@
-"""The loop around one tuner on one target: exact budget, statuses, recommendations.
+"""Run one tuner on one target: exact budget, statuses and recommendations.
 
-Nothing in here knows the truth. The loop gets a sealed task and a function that simulates; scoring
-against the truth happens later, in another process (`bench.runs.runner`).
+This module has no access to the true parameters. It gets a sealed task and a function that
+simulates. Scoring against the true parameters happens later, in another process
+(`bench.runs.runner`).
 """
 
 from __future__ import annotations
@@ -19,16 +20,19 @@ from bench.sealing.ended import EndedError, KilledError
 from methods.base import Array, Ask, Evaluation, Task
 
 Evaluate = Callable[[Array], "tuple[Array, Array]"]
-"""Unit-cube points (n, dim) -> observations (n, T, C), losses (n,)."""
+"""Function that simulates points (n, dim) of the unit cube.
+
+It returns observations (n, T, C) and losses (n,).
+"""
 
 
 class Steps(Protocol):
-    """A tuner's run as `methods.base.Steps`, here or in another process."""
+    """Run of a tuner, in this process or in another one; see `methods.base.Steps`."""
 
     def __next__(self) -> Array | Ask: ...
 
     def send(self, evaluation: Evaluation, /) -> Array | Ask:
-        """Hand an evaluation over; what the tuner asks for next."""
+        """Send an evaluation to the tuner and return its next proposal."""
         ...
 
     def close(self) -> None:
@@ -37,25 +41,31 @@ class Steps(Protocol):
 
 
 class Tunes(Protocol):
-    """What begins a run: a `methods.base.Tuner`, or one in another process."""
+    """Tuner that can be run: a `methods.base.Tuner`, or one in another process."""
 
     def tune(self, task: Task, rng: np.random.Generator, /) -> Steps:
-        """A run on this target."""
+        """Start a run on a target.
+
+        Args:
+            task: task of the target.
+            rng: random generator of the run.
+        """
         ...
 
 
 @dataclass(frozen=True)
 class Trace:
-    """What one run did.
+    """Trace of one run.
 
     Attributes:
         status: done, converged, timeout, crashed or diverged.
-        reason: why, in words; the traceback for a crash; empty for done.
-        proposals: (k, dim) what was simulated, unit cube.
-        losses: (k,).
-        recommendations: (k + 1, dim) what the tuner would deliver after 0, 1, ... k simulations.
-        tuner_seconds: (k,) time in the tuner before each simulation, shared out evenly over a
-            batch; of the last one also what came after it.
+        reason: reason of the status; the traceback for a crash; empty for done.
+        proposals: (k, dim) simulated points of the unit cube.
+        losses: (k,) losses of the simulated points.
+        recommendations: (k + 1, dim) points that the tuner recommends after 0, 1, ... k
+            simulations.
+        tuner_seconds: (k,) time in the tuner before each simulation, distributed evenly over a
+            batch; the last one includes the time after the last simulation.
         simulator_seconds: (k,) time in the simulator.
     """
 
@@ -69,13 +79,13 @@ class Trace:
 
 
 class _DivergenceError(Exception):
-    """A tuner proposed or recommended something that is not a finite number."""
+    """A tuner proposed or recommended a point that is not finite."""
 
 
 def _points(asked: object, dim: int, what: str) -> Array:
-    """The proposals as a fresh (n, dim) array inside the unit cube."""
+    """Return proposals as a new (n, dim) array, clipped to the unit cube."""
     points = as_points(asked, dim, what)
-    # Almost always inside, so what is dear is asked only otherwise.
+    # Nearly all points are inside, so the expensive check is done only if some are not.
     if not _inside(points):
         if not np.isfinite(points).all():
             first = points[~np.isfinite(points).all(axis=1)][0]
@@ -85,8 +95,9 @@ def _points(asked: object, dim: int, what: str) -> Array:
 
 
 def _inside(points: Array) -> bool:
-    """Whether all lies in 0..1; for the few numbers of one point a plain loop is three times
-    quicker than numpy.
+    """Return whether all points are inside the unit cube.
+
+    For the few numbers of one point a plain loop is three times faster than NumPy.
     """
     if points.size <= 32:
         return all(0.0 <= x <= 1.0 for x in points.ravel().tolist())
@@ -94,7 +105,7 @@ def _inside(points: Array) -> bool:
 
 
 class _Record:
-    """What a run has done so far."""
+    """Record of a run while it is running."""
 
     def __init__(self, task: Task) -> None:
         self.used = 0
@@ -108,23 +119,23 @@ class _Record:
 
     @property
     def diverged(self) -> bool:
-        """Whether something was simulated and nothing of it has a finite loss."""
+        """Whether points were simulated and none of them has a finite loss."""
         return self.used > 0 and self._best_loss == np.inf
 
     def recommend(self, recommendation: Array) -> None:
-        """Take what the tuner would deliver now, after all that it has seen."""
+        """Record what the tuner recommends after all evaluations so far."""
         self._recommended[-1] = _points(recommendation, self._dim, "recommendations")[0]
 
     def add(self, points: Array, losses: Array, stays: bool) -> None:
-        """Add simulated points (n, dim) and their losses (n,).
+        """Add simulated points and their losses.
 
         Args:
-            points: as the tuner gets them back.
-            losses: likewise.
-            stays: whether the tuner's last recommendation holds until it gives another; else the
-                best point so far is recommended.
+            points: (n, dim) points as the tuner gets them.
+            losses: (n,) losses as the tuner gets them.
+            stays: True if the tuner's last recommendation stays valid until the next one; otherwise
+                the best point so far is recommended.
         """
-        # The tuner gets these very arrays: sorting them would spoil the record.
+        # The tuner gets the same arrays; writing to them would change the record.
         points.setflags(write=False)
         losses.setflags(write=False)
         self.used += len(points)
@@ -136,18 +147,29 @@ class _Record:
             self._recommended.append(self._recommended[-1] if stays else self._best)
 
     def time(self, points: int, tuner: float, simulator: float) -> None:
-        """Add the seconds that so many points took."""
+        """Add the seconds spent on a batch of points.
+
+        Args:
+            points: number of points.
+            tuner: seconds in the tuner.
+            simulator: seconds in the simulator.
+        """
         self._tuner_seconds.append((points, tuner))
         self._simulator_seconds.append((points, simulator))
 
     def late(self, tuner: float) -> None:
-        """Add the seconds that came after the last simulation to those of its batch."""
+        """Add the seconds in the tuner after the last simulation to those of the last batch."""
         if self._tuner_seconds:
             points, seconds = self._tuner_seconds[-1]
             self._tuner_seconds[-1] = points, seconds + tuner
 
     def trace(self, status: str, reason: str) -> Trace:
-        """The whole run, now that it has ended."""
+        """Return the trace of the ended run.
+
+        Args:
+            status: status of the run.
+            reason: reason of the status.
+        """
         return Trace(
             status,
             reason,
@@ -166,24 +188,24 @@ def drive(
     rng: np.random.Generator,
     seconds: float = float("inf"),
 ) -> Trace:
-    """Run `tuner` on `task` until its budget is used, it stops, or it fails.
+    """Run a tuner on a task until its budget is used, it stops, or it fails.
 
-    Proposals outside the unit cube are moved to its border; a batch that would overshoot the budget
-    is cut. The `recommendations` follow `methods.base.Ask`; k = 0 is the start unless the tuner
-    recommends something else before its first simulation.
+    Proposals outside the unit cube are moved to its boundary. A batch that would exceed the budget
+    is shortened. The `recommendations` follow `methods.base.Ask`; for k = 0 the start is
+    recommended, unless the tuner recommends another point before its first simulation.
 
     Args:
-        tuner: fitted where it needs to be.
-        task: the sealed target.
-        evaluate: the simulator and loss.
-        rng: the run's own generator.
+        tuner: tuner, trained if it needs training.
+        task: task of the target, without its true parameters.
+        evaluate: function that simulates points and computes their losses.
+        rng: random generator of the run.
         seconds: time limit, checked between evaluations.
 
     Returns:
-        The trace; failures are a status there.
+        The trace; a failure is a status of it.
 
     Raises:
-        KilledError: the tuner's process was killed from outside, which is no failure of its own.
+        KilledError: the tuner's process was killed externally, which is not a failure of the tuner.
     """
     record = _Record(task)
     started = perf_counter()
@@ -198,12 +220,12 @@ def drive(
     except EndedError as ended:
         status, reason = ended.status, ended.reason
     except KilledError:
-        # Nothing that the run did: it is made again.
+        # The run is not the cause, so it is repeated.
         raise
     except Exception:
         status, reason = "crashed", traceback.format_exc()
     finally:
-        # Also where a person interrupts: what the tuner holds open is its own to close.
+        # After an interrupt, too, the tuner must close its resources.
         fault = _closed(steps)
     if status == "timeout":
         reason = f"stopped after {perf_counter() - started:.1f} s, limit {seconds:g} s"
@@ -218,12 +240,15 @@ def drive(
 def _exchange(
     steps: Steps, task: Task, evaluate: Evaluate, record: _Record, deadline: float
 ) -> tuple[str, str]:
-    """Simulate what the tuner asks for, until the budget or the time is used: status and reason.
+    """Simulate the tuner's proposals until the budget or the time limit is reached.
+
+    Returns:
+        Status and reason.
 
     Raises:
-        StopIteration: the tuner stopped; its value says why.
-        _DivergenceError: it gave something that is not finite.
-        Exception: it failed, or the simulator did.
+        StopIteration: the tuner stopped; the exception's value is its reason.
+        _DivergenceError: the tuner proposed or recommended a point that is not finite.
+        Exception: the tuner or the simulator failed.
     """
     before = perf_counter()
     asked = next(steps)
@@ -234,10 +259,10 @@ def _exchange(
             if recommendation is not None:
                 record.recommend(recommendation)
         points = _points(asked, task.dim, "proposals")
-        # Only now: what the tuner recommends after its last simulation counts.
+        # The check comes here, so that the recommendation after the last simulation is recorded.
         left = task.budget - record.used
         if left <= 0:
-            # And so does the time that it took to.
+            # The time that the tuner needed for this recommendation is recorded, too.
             record.late(perf_counter() - before)
             return "done", ""
         cut = len(points) > left
@@ -250,7 +275,7 @@ def _exchange(
         record.add(points, losses, stays=recommendation is not None)
         if after > deadline:
             return "timeout", ""
-        # A batch is handed back whole or not at all.
+        # The tuner gets the evaluations of complete batches only.
         if cut:
             return "done", ""
         before = perf_counter()
@@ -258,8 +283,8 @@ def _exchange(
 
 
 def _closed(steps: Steps | None) -> str:
-    """Close a tuner's generator; returns the traceback of what that raised, or nothing."""
-    # What is no generator has failed already, with a message of its own.
+    """Close a tuner's generator, and return the traceback of an error in it, or an empty text."""
+    # An object without `close` is not a generator, and has already failed with its own message.
     if steps is None or not hasattr(steps, "close"):
         return ""
     try:
@@ -274,7 +299,7 @@ def _closed(steps: Steps | None) -> str:
 
 
 def _shared_out(batches: list[tuple[int, float]]) -> Array:
-    """Seconds of each simulation from (size, seconds) of each batch."""
+    """Distribute (size, seconds) of batches evenly to their simulations."""
     sizes = np.array([n for n, _ in batches], dtype=np.int64)
     seconds = np.array([s for _, s in batches], dtype=np.float64)
     return np.repeat(seconds / np.maximum(sizes, 1), sizes)

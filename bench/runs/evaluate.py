@@ -1,4 +1,4 @@
-"""Simulates and scores proposals against one target's observation."""
+"""Simulate proposals, and score them against one target's observation."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ if TYPE_CHECKING:
 
 
 class Evaluator:
-    """Unit-cube points -> observations and losses; remembers the squared errors of what it
-    simulated.
+    """Evaluator of unit-cube points: simulates them, and computes and stores their errors.
 
     The loss of simulated y against observed o, over C channels of scale s and the N_c present
     samples of each, is the root mean square
 
         L^2 = 1/C sum_c 1/(N_c s_c^2) S_c,   S_c = sum_t (y_tc - o_tc)^2        (1)
         RMSE_c^2 = S_c / N_c                                                    (2)
+
+    Args:
+        problem: tuning problem.
+        side: runs of the target with their observations.
     """
 
     def __init__(self, problem: Problem, side: Side) -> None:
@@ -31,7 +34,7 @@ class Evaluator:
         missing = np.isnan(side.observed)
         self._missing = missing if missing.any() else None
         self._observed = np.where(missing, 0.0, side.observed)
-        # A channel without a single sample has no error, and must not divide by nothing.
+        # For a channel without samples the divisor must not be zero.
         present = np.maximum((~missing).sum(axis=0), 1)
         self._per_sample = 1.0 / present  # (2)
         self._per_loss = 1.0 / (present * problem.scale**2 * len(problem.scale))  # (1)
@@ -39,8 +42,13 @@ class Evaluator:
         self._seen: list[Array] = []
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Observations (n, T, C) and losses (n,) of `points` (n, dim); NaN and infinite where the
-        simulation failed.
+        """Simulate points and compute their losses.
+
+        Args:
+            points: (n, dim) points of the unit cube.
+
+        Returns:
+            Observations (n, T, C) and losses (n,); NaN and infinite if the simulation failed.
         """
         observations = self._problem.simulate(points, self._scenarios)
         single = observations.shape[0] == observations.shape[2] == 1
@@ -49,14 +57,16 @@ class Evaluator:
         squares = self._squares(observations)
         self._seen.append(squares)
         losses: Array = np.sqrt(squares @ self._per_loss)  # (1)
-        # What failed is worse than anything: NaN would compare as neither.
+        # The loss of a failed simulation is infinite, because comparisons with NaN are always
+        # false.
         if not all(map(math.isfinite, losses.tolist())):
             losses[~np.isfinite(losses)] = np.inf
         return observations, losses
 
     def _one_loss(self, observations: Array) -> Array:
-        """The loss (1,) of one observation of one channel: most evaluations, so worth a third of
-        the general way.
+        """Compute the loss (1,) of one observation of one channel without missing samples.
+
+        Most evaluations are of this kind, and this takes a third of the time of the general case.
         """
         difference = (observations - self._observed).ravel()
         square = float(difference.dot(difference))  # S of (1)
@@ -65,25 +75,32 @@ class Evaluator:
         return np.array([math.sqrt(loss) if math.isfinite(loss) else math.inf])
 
     def _squares(self, observations: Array) -> Array:
-        """Sums (n, C) of squared errors over present samples, in squared channel units."""
+        """Compute sums (n, C) of squared errors over present samples, in squared channel units."""
         difference = observations - self._observed
         if self._missing is not None:
             difference[:, self._missing] = 0.0
-        # In place: observations of a large batch would not fit twice.
+        # Squared in place, because the observations of a large batch would not fit in memory twice.
         difference *= difference
         sums: Array = np.add.reduce(difference, axis=1)
         return sums
 
     def rmse(self, proposals: Array, recommendations: Array) -> Array:
-        """Root-mean-square errors (k, C), in channel units, of recommended points (k, dim).
+        """Compute the RMS errors of recommended points, in channel units.
 
-        Points among `proposals`, the points simulated so far in their order, are looked up; the
-        others are simulated, outside the tuner's budget, since they only measure it.
+        Points among `proposals` are looked up. The others are simulated outside the tuner's budget,
+        because these simulations only measure the error.
+
+        Args:
+            proposals: (m, dim) points simulated so far, in their order.
+            recommendations: (k, dim) recommended points.
+
+        Returns:
+            (k, C) root-mean-square errors.
         """
         known = {point.tobytes(): row for point, row in zip(proposals, self._rows(), strict=True)}
         result = np.empty((len(recommendations), len(self._per_sample)))
         for i, point in enumerate(recommendations):
-            # Bytes and not numbers: a point is known only if it is the very one.
+            # Points are compared by their bytes, so that only an identical point is looked up.
             key = point.tobytes()
             if key not in known:
                 known[key] = self._squares(self._problem.simulate(point[None], self._scenarios))[0]

@@ -1,4 +1,4 @@
-"""What a worker process sets up for itself, so that nothing done in it reaches beyond it."""
+"""Set up a worker process so that it cannot affect the terminal or outlive its parent."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ if TYPE_CHECKING:
 
 
 def initialise(plugins: Sequence[Plugin], births: Any) -> None:
-    """Prepare a worker: interrupts are the parent's to handle, output goes nowhere, no worker
-    outlives its parent, and nobody reads its memory.
+    """Initialise a worker process.
+
+    It ignores interrupts, discards its output, ends with its parent, and protects its memory from
+    other processes.
 
     Args:
-        plugins: to load, or to know of.
-        births: where the worker tells that it is there.
+        plugins: plugins to load or to register.
+        births: connection on which the worker reports that it has started.
     """
-    # A terminal's Ctrl-C reaches every process of the group; the parent alone answers it.
+    # Ctrl-C in a terminal reaches every process of the group; only the parent handles it.
     ignore_interrupts()
-    # First of all that may fail: a birth that nobody hears of would look like a worker at work.
+    # This comes before everything that may fail: an unreported start would look like a busy worker.
     births.send(os.getpid())
     threading.Thread(target=_end_with_parent, daemon=True, name="end-with-parent").start()
     hide_memory()
@@ -36,10 +38,10 @@ def initialise(plugins: Sequence[Plugin], births: Any) -> None:
 
 
 def _silence() -> None:
-    """Send what is printed to nowhere: a tuner that prints would spoil the table or fill a disk."""
+    """Discard all output: a tuner that prints would disturb the table or fill a disk."""
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
-    # The descriptors and not `sys.stdout`: libraries in C write there too.
+    # The file descriptors are replaced, because C libraries do not use `sys.stdout`.
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
@@ -47,11 +49,11 @@ def _silence() -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when the one that started it is gone, even if a run is hanging."""
+    """End this process when its parent ends, even if a run hangs."""
     from multiprocessing import connection, parent_process
 
     parent = parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
-        # Not sys.exit, which would end this thread and leave the run hanging.
+        # `sys.exit` would end this thread only.
         os._exit(1)

@@ -1,6 +1,4 @@
-"""Where a process has the tuners live that it drives: one nursery, and the tuners that serve more
-than one run.
-"""
+"""Start and reuse the isolated tuner processes of this process, with one fork server."""
 
 from __future__ import annotations
 
@@ -28,24 +26,29 @@ _KNOWN = (
     "bench", "botorch", "cma", "gpytorch", "linear_operator", "methods", "nlopt", "numpy", "pandas",
     "pysindy", "sbi", "scipy", "sims", "skopt", "sklearn", "statsmodels", "torch",
 )  # fmt: skip
-"""Packages that may be loaded ahead of a run: simgap's own and those that it requires. What else a
-plugin imports is imported anew in each run: it could remember what an earlier one has seen.
+"""Packages that may be imported before a run: simgap's own and those that it requires.
+
+Other packages that a plugin imports are imported anew in each run, because they could store
+information from an earlier run.
 """
 _KEPT = 8
-"""Tuners that wait for another run at a time."""
+"""Maximum number of idle tuners that wait for another run."""
 
 RETRIES = 3
-"""How often work is begun whose processes are killed from outside, which says nothing about it."""
+"""Maximum number of attempts at work whose processes are killed externally.
+
+An external kill gives no information about the work itself.
+"""
 
 _houses: dict[int, Nursery] = {}
 _waiting: OrderedDict[Any, SealedTuner] = OrderedDict()
 
 
 def nursery() -> Nursery:
-    """The nursery of this process, begun when it is first needed."""
+    """Return the fork server of this process; it is started at the first call."""
     held = _houses.get(0)
     if held is None or not held.alive:
-        # Also one that was killed from outside, which leaves a folder.
+        # A fork server that was killed externally is closed too, because its folder still exists.
         close()
         held = _houses[0] = Nursery()
     return held
@@ -53,10 +56,10 @@ def nursery() -> Nursery:
 
 @cache
 def seals() -> tuple[str, ...]:
-    """The seals that hold around a tuner's process on this machine; see `bench.sealing.seals`.
+    """Return the active isolation layers of tuner processes here; see `bench.sealing.seals`.
 
     Raises:
-        InputError: no such process can be started.
+        InputError: no isolated process can be started.
     """
     try:
         return undisturbed(_seals)
@@ -77,7 +80,7 @@ def _seals() -> tuple[str, ...]:
 
 
 def close() -> None:
-    """End every tuner's process of this one."""
+    """End all tuner processes of this process, and its fork server."""
     _waiting.clear()
     for house in _houses.values():
         house.close()
@@ -85,22 +88,28 @@ def close() -> None:
 
 
 def undisturbed(work: Callable[[], Result]) -> Result:
-    """What `work` gives; it is begun again where one of its processes was killed from outside.
+    """Call a function, again if one of its processes was killed externally.
+
+    Args:
+        work: function without arguments.
+
+    Returns:
+        The result of the function.
 
     Raises:
-        EndedError: that happened again and again.
+        EndedError: processes were killed in each of `RETRIES` attempts.
     """
     for _ in range(RETRIES):
         try:
             return work()
         except KilledError as killed:
             said = str(killed)
-    # By then it is more likely its own doing.
+    # After several kills the work itself is the more likely cause.
     raise EndedError("crashed", f"{said}, {RETRIES} times")
 
 
 def tuned_of(entry: Entry) -> Tuned:
-    """Which tuner an entry stands for, wherever its code is."""
+    """Return the specification of the tuner of an entry, for an isolated process."""
     kind = tuners.get(entry.tuner)
     place = tuners.place(entry.tuner)
     module = getattr(kind, "module", "") or kind.__module__
@@ -118,8 +127,9 @@ def _file_of(module: str) -> str:
 
 @cache
 def ahead_of(file: str) -> tuple[str, ...]:
-    """The packages that a source file imports anywhere in it, as far as they are known, and those
-    that these of this project import: they are read, and nothing of the file is run.
+    """Return the known packages that a source file imports, directly or through simgap's tuners.
+
+    The files are parsed; their code does not run.
     """
     wanted: dict[str, None] = {}
     files = [file]
@@ -135,7 +145,7 @@ def ahead_of(file: str) -> tuple[str, ...]:
 def _imported(file: str) -> list[str]:
     try:
         tree = ast.parse(Path(file).read_bytes())
-    # Deep enough a file is more than the parser can take.
+    # A deeply nested file can exceed the limits of the parser.
     except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
         return []
     names: list[str] = []
@@ -156,23 +166,26 @@ def housed(
     memory: int = 0,
     state: Mapping[str, NDArray[Any]] | None = None,
 ) -> Iterator[SealedTuner]:
-    """A tuner in its process, for one run or one training.
+    """Start an isolated tuner for one run or one training, or reuse an idle one.
 
     Args:
-        tuned: which one.
-        seed: of the run.
-        isolation: run: it is ended afterwards; tuner: it serves the next run of this tuner with
-            this seed.
-        hidden: folders that it must not reach.
-        memory: MiB that it may take; 0 for no limit.
-        state: what it has learned.
+        tuned: specification of the tuner.
+        seed: seed of the run.
+        isolation: ``run``: the process is ended afterwards; ``tuner``: it serves the next run of
+            this tuner with this seed.
+        hidden: folders that the process must not access.
+        memory: memory limit in MiB; 0 for no limit.
+        state: trained weights.
+
+    Yields:
+        The isolated tuner.
 
     Raises:
-        EndedError: it cannot be built.
-        KilledError: it was killed from outside.
+        EndedError: the tuner cannot be built.
+        KilledError: the process was killed externally.
     """
     kept = isolation == "tuner"
-    # Weights are hashed only where a tuner may wait that has others.
+    # Weights are hashed only if an idle tuner could have different ones.
     key = (repr(tuned), seed, hidden, memory, _digest(state or {})) if kept else None
     tuner = _waiting.pop(key, None)
     if tuner is not None:

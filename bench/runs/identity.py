@@ -1,9 +1,8 @@
-"""Names for runs: a readable id that changes with everything that determines a run, and with
-nothing else.
+"""Run identifiers that change with everything that determines a run, and with nothing else.
 
-``cma_es/wide-017/0/3f9ac2d15b`` is tuner, target and seed, and a hash of the tuner's options, the
-simulator with its settings, the target's scenario and observation, budget, limits, code and package
-versions.
+``cma_es/wide-017/0/3f9ac2d15b`` consists of tuner, target, seed and a hash. The hash covers the
+tuner's options, the simulator with its settings, the target's scenario and observation, budget,
+limits, code and package versions.
 """
 
 from __future__ import annotations
@@ -56,15 +55,21 @@ NOT_OF_A_RUN = {
     "nuisance": "matters to entries that are randomised alone, and is hashed with them",
     "tuners": "who else runs; each run's id has its own tuner with its options",
 }
-"""Keys of an experiment that change no run by themselves, each with the reason; all others do."""
+"""Keys of an experiment that do not change any run by themselves, each with the reason."""
 
 
 def fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
-    """Hashes of everything that must not change while an experiment is under way, by what a person
-    would call it.
+    """Hash everything that must not change while an experiment is running.
+
+    Args:
+        experiment: configuration of the experiment.
+        plugins: plugin files.
+
+    Returns:
+        Hashes by readable name.
     """
     return {
-        # A salt is secret until the end, and its commitment stands from the beginning.
+        # The salt is secret until the end, but its commitment exists from the beginning.
         "configuration": digest(experiment.name, experiment.chosen(salt="").document())
         if experiment.salt_sha256
         else digest(experiment.name, experiment.document()),
@@ -78,35 +83,40 @@ def fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str
 
 
 def _rooms(experiment: Experiment) -> tuple[str, ...]:
-    """Folders whose code makes its results, where there are more than those of a comparison."""
+    """Return the source folders that determine the results, if more than those of a comparison."""
     if experiment.shot:
         return SHOT_ROOMS
     return EXPLAIN_ROOMS if experiment.calibration else ()
 
 
 def _classes(experiment: Experiment) -> list[str]:
-    """Sources of an experiment's simulator and tuners; a notebook's are in no plugin file."""
+    """Hash the sources of simulator and tuners; classes of a notebook are in no plugin file."""
     sources = [source(kind_of(experiment))]
     for entry in experiment.tuners:
         try:
             sources.append(source(tuners.get(entry.tuner)))
-        # It has no run that could be mixed with another kind; it shows once it can be used.
+        # A skipped tuner has no runs yet; its hash changes when it becomes available.
         except SkippedError:
             sources.append("skipped")
     return sources
 
 
 def refuse_changes(folder: Path, before: dict[str, str], now: dict[str, str]) -> None:
-    """Refuse to mix runs of two configurations.
+    """Raise an error if the configuration of a study has changed.
+
+    Args:
+        folder: folder of the study.
+        before: fingerprint when the study was started.
+        now: present fingerprint.
 
     Raises:
-        InputError: something changed since the folder was begun.
+        InputError: something has changed since the study was started.
     """
     if not before:
         raise InputError(
             f"{folder}: written by an older simgap, which cannot be resumed; start a new comparison"
         )
-    # The first that differs says most: what a person changed comes before what follows from it.
+    # The first difference is reported: direct changes are listed before their consequences.
     for what, hashed in now.items():
         if before.get(what) != hashed:
             raise InputError(
@@ -117,17 +127,20 @@ def refuse_changes(folder: Path, before: dict[str, str], now: dict[str, str]) ->
 
 
 def unchanged(folder: Path, held: Configuration, plugins: Sequence[str]) -> list[str]:
-    """See that a study can be taken up where it was left; returns all the plugin files it needs.
+    """Check that a study can be resumed, and load its plugins.
 
     Args:
-        folder: the study's.
-        held: what it was begun with; these plugins are loaded.
-        plugins: plugin files beside those; loaded too.
+        folder: folder of the study.
+        held: configuration with which the study was started.
+        plugins: additional plugin files.
+
+    Returns:
+        All plugin files that the study needs.
 
     Raises:
-        InputError: something that matters changed since it was begun.
+        InputError: something relevant has changed since the study was started.
     """
-    # The folder's own come first, in their order, as when it was begun.
+    # The study's own plugins come first and in their order, as when it was started.
     given = {str(Path(p).resolve()) for p in plugins}
     everything = held.plugins + sorted(given - set(held.plugins))
     admit(everything, held.experiment)
@@ -136,7 +149,7 @@ def unchanged(folder: Path, held: Configuration, plugins: Sequence[str]) -> list
 
 
 class Identities:
-    """Ids of an experiment's runs."""
+    """Identifiers of an experiment's runs."""
 
     def __init__(self, experiment: Experiment) -> None:
         self._experiment = experiment
@@ -152,8 +165,15 @@ class Identities:
         self._targets: dict[str, str] = {}
 
     def run(self, entry: Entry, target: SealedTarget, seed: int, budget: int) -> str:
-        """The id of one run."""
-        # Hashed once: a plan may have a million runs.
+        """Return the identifier of one run.
+
+        Args:
+            entry: entry of the tuner.
+            target: target of the run.
+            seed: seed of the tuner.
+            budget: number of simulations.
+        """
+        # Hashes are cached, because a plan may have a million runs.
         if entry.label not in self._entries:
             kind = tuners.get(entry.tuner)
             training = self._experiment.training_budget if kind.learned else 0
@@ -170,7 +190,7 @@ class Identities:
 
 
 def _target(target: SealedTarget) -> str:
-    """Hash of a target's scenarios, observations and start."""
+    """Hash a target's scenarios, observations and start."""
     sides = [target.fitting, target.held_out]
     scenarios = [
         [s.times.tobytes(), s.initial, {k: v.tobytes() for k, v in s.inputs.items()}, s.constants]

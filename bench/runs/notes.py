@@ -1,4 +1,4 @@
-"""Notes for the author of a tuner about its isolated runs, in addition to their statuses."""
+"""Collect notes for the author of a tuner about its isolated runs, in addition to statuses."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from statistics import median
 from bench.runs.worker import Outcome
 
 SLOW_IMPORTS = 1.0
-"""Seconds of imports before each run from which one process for several runs is suggested."""
+"""Minimum import time of a run, in seconds, for suggesting one process for several runs."""
 _NAMED = 3
-"""Number of files whose names are shown."""
+"""Maximum number of file names in a note."""
 
 
 @dataclass
 class _OfTuner:
-    """What is known of the runs of one tuner."""
+    """Information about the runs of one tuner."""
 
     files: int = 0
     names: dict[str, None] = field(default_factory=dict)
@@ -26,17 +26,22 @@ class _OfTuner:
 
 @dataclass
 class Notes:
-    """Collects what runs tell, by the label of their tuner.
+    """Collected information of runs, by tuner label.
 
     Attributes:
-        isolation: of the experiment.
+        isolation: isolation of the experiment, ``run`` or ``tuner``.
     """
 
     isolation: str
     _tuners: dict[str, _OfTuner] = field(default_factory=lambda: defaultdict(_OfTuner))
 
     def add(self, label: str, outcome: Outcome) -> None:
-        """Take in one run."""
+        """Add the information of one run.
+
+        Args:
+            label: label of the tuner.
+            outcome: outcome of the run.
+        """
         tuner = self._tuners[label]
         written = outcome.written
         tuner.files += written.files
@@ -46,7 +51,7 @@ class Notes:
             tuner.import_seconds.append(outcome.import_seconds)
 
     def lines(self) -> list[str]:
-        """One line for each tuner whose files were discarded or whose imports are slow."""
+        """Return a line for each tuner whose files were discarded or whose imports are slow."""
         lines = []
         for label, tuner in self._tuners.items():
             if tuner.files:

@@ -1,9 +1,11 @@
-"""Worker processes that can be killed: one run at a time in each, a hard limit, and a death costs
-no more than a run. Or no worker process at all, where somebody wants to look on.
+"""Execute calls in worker processes with hard time limits, or in this process.
 
-Every worker is a pebble pool of its own with a single process. pebble shares one channel, guarded
-by two locks, among the workers of a pool: a worker that is killed while it holds them would stop
-all of them, and here stops only itself.
+A worker executes one call at a time. If it dies, only this call is lost. In this process no worker
+is used, so that prints and breakpoints work.
+
+Every worker is a separate pebble pool with a single process. The workers of one pebble pool share a
+channel that is protected by two locks. A worker that is killed while it holds them would block all
+workers of its pool; here it blocks only itself.
 """
 
 from __future__ import annotations
@@ -31,21 +33,24 @@ if TYPE_CHECKING:
     from bench.runs.survey import Plugin
 
 GRACE = 30.0
-"""Seconds by which the hard limit, which kills, exceeds the soft one, which a cooperative run meets
-by itself.
+"""Difference between hard and soft time limit in seconds.
+
+A cooperative run ends at the soft limit; the worker is killed at the hard limit.
 """
 RETRIES = 3
-"""How often a call is made again whose worker was killed from outside, which says nothing about the
-call.
+"""Maximum number of repetitions of a call whose worker was killed externally.
+
+An external kill gives no information about the call itself.
 """
 _OUTSIDE = (-9, -15, 15)
-"""Exit codes of a worker that was told to end: SIGKILL (also the kernel's, short of memory),
-SIGTERM.
+"""Exit codes of a worker that was killed externally: SIGKILL and SIGTERM.
+
+SIGKILL is also sent by the kernel if memory is exhausted.
 """
 _FUTILE = 10
-"""Workers that may die one after another before they do anything; then it is not chance."""
+"""Maximum number of successive workers that die before they do any work."""
 _SHORT = 1.0
-"""Seconds below which a worker is given its next call ahead of time."""
+"""Calls shorter than this many seconds are queued in advance at the workers."""
 
 Call = tuple[Callable[..., Any], tuple[Any, ...]]
 
@@ -55,21 +60,25 @@ class DeathError(RuntimeError):
 
 
 class LostError(RuntimeError):
-    """What makes the calls is gone, and with it the calls that had no end; the message says what
-    is.
-    """
+    """The executor of the calls is lost, and unfinished calls with it; the message names it."""
 
 
 class Pool(Protocol):
-    """What makes calls: worker processes here, a cluster's, or this process itself."""
+    """Executor of calls: local worker processes, a cluster, or this process."""
 
     def load(self, plugins: Sequence[Plugin]) -> None:
-        """Make these plugins known to the workers; before the first call."""
+        """Register plugins for the workers; must be called before the first call."""
         ...
 
     def results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
-        """Place and result (or exception) of each call, as they end; `seconds` is the soft limit of
-        one.
+        """Iterate over the results of calls in the order in which they end.
+
+        Args:
+            calls: functions with their arguments.
+            seconds: soft time limit of one call.
+
+        Yields:
+            Index of the call, and its result or exception.
         """
         ...
 
@@ -79,10 +88,10 @@ class Pool(Protocol):
 
 
 def pool_of(jobs: int) -> Pool:
-    """So many worker processes on this machine; for 0 this process makes the calls itself.
+    """Return a pool of worker processes on this machine, or of this process for 0 workers.
 
     Raises:
-        InputError: fewer than 0.
+        InputError: `jobs` is negative.
     """
     if jobs < 0:
         raise InputError(f"jobs: expected a number of worker processes from 0 on, found {jobs}")
@@ -90,14 +99,14 @@ def pool_of(jobs: int) -> Pool:
 
 
 class InProcessPool:
-    """Makes the calls in this process, one after another: prints show, and breakpoints hold.
+    """Executor of calls in this process, one after another, so that prints and breakpoints work.
 
-    Nothing is isolated. A call that hangs hangs all, one that ends its process ends all, a class
-    need not be in a file, and nothing but a tuner's good manners keeps it from the truth.
+    There is no isolation. A call that hangs or ends its process stops everything, a class need not
+    be in a file, and a tuner could read the true parameters.
     """
 
     def load(self, plugins: Sequence[Plugin]) -> None:
-        """Nothing is to be done: who makes the calls has loaded the plugins."""
+        """Do nothing, because the caller has loaded the plugins in this process."""
 
     def __enter__(self) -> InProcessPool:
         return self
@@ -105,7 +114,7 @@ class InProcessPool:
     def __exit__(self, *_: object) -> None:
         from bench.runs.worker import release
 
-        # A notebook may define a simulator anew under its old name before the next comparison.
+        # A notebook may redefine a simulator under the same name before the next comparison.
         release()
 
     def results(
@@ -113,9 +122,16 @@ class InProcessPool:
         calls: Sequence[Call],
         seconds: float,  # noqa: ARG002 - there is nobody who could end a call past its limit
     ) -> Iterator[tuple[int, Any]]:
-        """Place and result (or exception) of each call, in their order.
+        """Iterate over the results of calls, in their order.
 
-        What a call raises is said on stderr too, while the person who wrote it is looking.
+        Exceptions are also printed on stderr, for the author of the code.
+
+        Args:
+            calls: functions with their arguments.
+            seconds: time limit; not used, because a call in this process cannot be ended.
+
+        Yields:
+            Index of the call, and its result or exception.
         """
         with one_thread():
             for place in range(len(calls)):
@@ -135,7 +151,7 @@ class InProcessPool:
 
 @dataclass
 class _Given:
-    """A call handed to a worker."""
+    """Call that is assigned to a worker."""
 
     place: int
     deaths: int = 0
@@ -144,8 +160,9 @@ class _Given:
 
 @dataclass
 class _Pace:
-    """How many calls a worker has at a time: short ones come in twos, so that none waits for the
-    next.
+    """Number of calls that a worker has at a time.
+
+    If calls are short, a second one is queued, so that a worker does not wait for its next call.
     """
 
     depth: int = 1
@@ -153,26 +170,26 @@ class _Pace:
     busy: float = 0.0
 
     def note(self, seconds: float) -> None:
-        """Count a call that ended after so many seconds."""
+        """Count a call that took a number of seconds."""
         self.ended += 1
         self.busy += seconds
 
     def adapt(self) -> None:
-        """Choose the depth for what comes."""
-        # While two are given ahead, a call's time counts the wait for the one before it.
+        """Choose the number of calls per worker from the mean duration so far."""
+        # With two calls queued, the time of a call includes the wait for the one before it.
         short = self.ended and self.busy / self.ended < self.depth * _SHORT
         self.depth = 2 if short else 1
 
 
 class LocalPool:
-    """Worker processes on this machine, each a fresh interpreter with one arithmetic thread.
+    """Worker processes on this machine, each a new interpreter with one numerical thread.
 
     Args:
-        jobs: how many.
+        jobs: number of worker processes.
     """
 
     def __init__(self, jobs: int) -> None:
-        # Workers inherit it; libraries read it when they are first loaded.
+        # Workers inherit the variables; numerical libraries read them when they are loaded.
         for name in THREADS:
             os.environ.setdefault(name, "1")
         self._jobs = jobs
@@ -180,7 +197,7 @@ class LocalPool:
         self._slots: list[_Slot] = []
 
     def load(self, plugins: Sequence[Plugin]) -> None:
-        """Make these plugins known to the workers; before the first call."""
+        """Register plugins for the workers; must be called before the first call."""
         self._plugins = list(plugins)
 
     def __enter__(self) -> LocalPool:
@@ -191,17 +208,25 @@ class LocalPool:
             slot.stop()
 
     def results(self, calls: Sequence[Call], seconds: float) -> Iterator[tuple[int, Any]]:
-        """Place and result (or exception) of each call, as they end.
+        """Iterate over the results of calls in the order in which they end.
 
-        A call past its limit ends in `TimeoutError`, one whose worker dies in `DeathError`; after
-        `RETRIES` deaths from outside (the kernel's, an operator's) too.
+        A call that exceeds its limit gives a `TimeoutError`. A call whose worker dies gives a
+        `DeathError`; if the worker was killed externally (by the kernel or a user), only after
+        `RETRIES` repetitions.
+
+        Args:
+            calls: functions with their arguments.
+            seconds: soft time limit of one call.
+
+        Yields:
+            Index of the call, and its result or exception.
 
         Raises:
-            InputError: workers die before they do anything.
+            InputError: workers die before they do any work.
         """
         limit = None if math.isinf(seconds) else seconds + GRACE
         if not self._slots:
-            stepping()  # made here: a worker says nothing of what it waits for
+            stepping()  # executed here, because a worker cannot report what it waits for
         self._slots = self._slots or [_Slot(self._plugins) for _ in range(self._jobs)]
         following = deque(_Given(place) for place in range(len(calls)))
         pace = _Pace()
@@ -210,7 +235,7 @@ class LocalPool:
             futures = [future for slot in self._slots for future in slot.given]
             if not futures:
                 return
-            # Not for ever: a worker that left with code 0 ends no future.
+            # The timeout is needed because a worker that exits with code 0 completes no future.
             wait(futures, timeout=1.0, return_when=FIRST_COMPLETED)
             for slot in self._slots:
                 for one, result in slot.collect(following):
@@ -221,7 +246,7 @@ class LocalPool:
     def _hand_out(
         self, following: deque[_Given], depth: int, calls: Sequence[Call], limit: float | None
     ) -> None:
-        """Give every worker up to `depth` calls; everybody the first before anybody the second."""
+        """Assign up to `depth` calls to every worker; all get a first before any gets a second."""
         for _ in range(depth):
             for slot in self._slots:
                 if following and len(slot.given) < depth:
@@ -229,8 +254,9 @@ class LocalPool:
 
 
 class _Slot:
-    """One worker process, made anew whenever it is lost: what a dying process leaves in its pipe is
-    never read.
+    """One worker process, replaced whenever it is lost.
+
+    A new process has a new pipe, so that the rest of a dead process's message is never read.
     """
 
     def __init__(self, plugins: list[Plugin]) -> None:
@@ -242,41 +268,47 @@ class _Slot:
     def _start(self) -> None:
         from pebble import ProcessPool
 
-        # Not forked: a fork inherits the parent's memory, and in it the truth.
+        # A forked process would inherit the parent's memory with the true parameters.
         context = WorkerContext()
-        # Each process that the pool starts tells of its birth here: a second one means that the
-        # first is dead, which pebble does not notice where it exited with code 0.
+        # Each process that the pool starts reports here. A second report means that the first
+        # process is dead, which pebble does not notice if the exit code is 0.
         self._births, telling = context.Pipe(duplex=False)
         self._born = 0
         arguments = (self._plugins, telling)
         self._pool = ProcessPool(1, initializer=initialise, initargs=arguments, context=context)
 
     def stop(self) -> None:
-        """End the process, and whatever it is at."""
+        """End the process, including a running call."""
 
         def end(pool: Any = self._pool) -> None:
             pool.stop()
             pool.join()
 
-        # In a thread, since pebble would wait for ever for the rest of a message whose sender was
-        # killed.
+        # This runs in a thread, because pebble would wait forever for the rest of a message whose
+        # sender was killed.
         ending = threading.Thread(target=end, daemon=True, name="ending-a-worker")
         ending.start()
         ending.join(timeout=5.0)
 
     def give(self, one: _Given, calls: Sequence[Call], limit: float | None) -> None:
-        """Hand a call over; a pool that broke in the meantime is replaced."""
+        """Assign a call to the process; replace a pool that broke in the meantime.
+
+        Args:
+            one: call to assign.
+            calls: all calls.
+            limit: hard time limit in seconds; None for no limit.
+        """
         function, arguments = calls[one.place]
         one.given = monotonic()
         try:
             future = self._pool.schedule(function, args=arguments, timeout=limit)
-        except RuntimeError:  # it broke between two calls
+        except RuntimeError:  # the pool broke between two calls
             self._renew()
             future = self._pool.schedule(function, args=arguments, timeout=limit)
         self.given[future] = one
 
     def collect(self, again: deque[_Given]) -> list[tuple[_Given, Any]]:
-        """The calls that ended; what a lost worker never began goes back in front of `again`."""
+        """Return the ended calls; put those that a lost worker did not begin back into `again`."""
         ended: list[tuple[_Given, Any]] = []
         lost = False
         for future in [future for future in self.given if future.done()]:
@@ -299,7 +331,7 @@ class _Slot:
         return ended
 
     def _died_quietly(self) -> bool:
-        """Whether the process was replaced although a call that it was at has no end."""
+        """Return whether the process was replaced although its running call has no result."""
         while self._births.poll():
             self._births.recv()
             self._born += 1
@@ -317,19 +349,22 @@ class _Slot:
 
 
 def _exit_code(error: BaseException | None) -> int | None:
-    """How the worker process left, where pebble says that this ended the call."""
+    """Return the exit code of the worker process if pebble reports that this ended the call."""
     return getattr(error, "exitcode", None)
 
 
 def _loses_the_worker(error: BaseException | None) -> bool:
-    """Whether the worker of a call with this end is gone: it died, or was killed at its limit."""
+    """Return whether the worker of an ended call is gone: it died, or was killed at its limit."""
     return _exit_code(error) is not None or isinstance(error, BrokenExecutor | FutureTimeoutError)
 
 
 def _is_to_be_made_again(one: _Given, error: BaseException | None) -> bool:
-    """Whether the end of a call says nothing about the call; counts the deaths that it has met."""
+    """Return whether to repeat a call, because its end gives no information about it.
+
+    It also counts the deaths of workers during the call.
+    """
     code = _exit_code(error)
-    # A pool that broke had not begun the call, or not told what came of it.
+    # A broken pool has not begun the call, or has not reported its result.
     again = isinstance(error, BrokenExecutor) or (code in _OUTSIDE and one.deaths < RETRIES)
     if again:
         one.deaths += code is not None
@@ -337,14 +372,14 @@ def _is_to_be_made_again(one: _Given, error: BaseException | None) -> bool:
 
 
 def _end_of(error: BaseException) -> BaseException:
-    """What a call that failed gives in place of a result."""
+    """Return the exception that replaces the result of a failed call."""
     if isinstance(error, FutureTimeoutError):
-        return TimeoutError(str(error))  # before Python 3.11 the two are different classes
+        return TimeoutError(str(error))  # two different classes before Python 3.11
     code = _exit_code(error)
     return error if code is None else DeathError(_says(code))
 
 
 def _says(code: int) -> str:
-    """How a worker process ended, in words."""
+    """Describe how a worker process ended."""
     said = how_it_ended("the worker process", code)
     return f"{said} (out of memory?)" if code == -9 else said

@@ -1,4 +1,4 @@
-"""Scores a run against the truth, in the parent process, and lays it out as rows."""
+"""Score a run against the true parameters, in the parent process, and build its result rows."""
 
 from __future__ import annotations
 
@@ -15,8 +15,15 @@ from bench.store.status import Status
 
 
 def unfinished(problem: Problem, target: Target, status: str, reason: str) -> Outcome:
-    """The outcome of a run of which nothing but its end is known: it stands where it started, with
-    no simulation.
+    """Make the outcome of a run that ended without a trace.
+
+    It has no simulations, and its only recommendation is the start.
+
+    Args:
+        problem: tuning problem.
+        target: target of the run.
+        status: status of the run.
+        reason: reason of the status.
     """
     nothing, start = np.empty(0), target.sealed.start[None]
     trace = Trace(status, reason, start[:0], nothing, start, nothing, nothing)
@@ -24,7 +31,13 @@ def unfinished(problem: Problem, target: Target, status: str, reason: str) -> Ou
 
 
 def status_of(problem: Problem, order: Order, outcome: Outcome) -> Status:
-    """The status row of a run."""
+    """Make the status row of a run.
+
+    Args:
+        problem: tuning problem.
+        order: request of the run.
+        outcome: outcome of the run.
+    """
     trace = outcome.trace
     return Status(
         run=order.run,
@@ -47,9 +60,18 @@ def rows(
     outcome: Outcome,
     spectrum: Spectrum | None = None,
 ) -> dict[str, Any]:
-    """Columns of runs.parquet for one run, one entry for each k = 0..simulations.
+    """Build the columns of runs.parquet for one run, with a row for each k = 0..simulations.
 
-    With a spectrum the parameters' error is there along stiff and along sloppy directions too.
+    Args:
+        problem: tuning problem.
+        order: request of the run.
+        target: target with its true parameters.
+        outcome: outcome of the run.
+        spectrum: Fisher-information spectrum of the target; if given, parameter errors along stiff
+            and along sloppy directions are added.
+
+    Returns:
+        Values by column name.
     """
     trace = outcome.trace
     k = len(trace.losses)
@@ -67,18 +89,18 @@ def rows(
     }
     columns |= _parameter_columns(problem, target, outcome)
     if spectrum is not None and target.truth is not None:
-        # Directions mix parameters, so these must have one unit: training widths.
+        # Directions combine parameters, which therefore need a common unit: training widths.
         away = problem.cube.physical(trace.recommendations) - target.truth
         widths = away / problem.cube.training_widths()
         columns["stiff_error"], columns["sloppy_error"] = spectrum.errors(widths)
     columns["obs_error"] = outcome.obs_rmse[:, problem.error_channel]
-    # Every run of a comparison has the same columns, so that its rows fit into one table.
+    # All runs of a comparison have the same columns, so that their rows form one table.
     nothing = np.full((k + 1, len(problem.channels)), np.nan)
     heldout = nothing if outcome.heldout_rmse is None else outcome.heldout_rmse
     columns["heldout_error"] = heldout[:, problem.error_channel]
     for i, channel in enumerate(problem.channels):
         columns[f"obs_error_{channel.name}"] = outcome.obs_rmse[:, i]
-        # Without noise there is no such unit.
+        # Without noise the error cannot be measured in units of the noise.
         noise = problem.noise[i] if problem.noise[i] > 0 else np.nan
         columns[f"obs_error_{channel.name}_in_noise"] = outcome.obs_rmse[:, i] / noise
         columns[f"heldout_error_{channel.name}"] = heldout[:, i]
@@ -88,11 +110,11 @@ def rows(
 
 
 def _parameter_columns(problem: Problem, target: Target, outcome: Outcome) -> dict[str, Any]:
-    """Parameter errors, proposals, recommendations and the truth, one column a parameter."""
+    """Build columns of parameter errors, proposals, recommendations and true parameters."""
     cube = problem.cube
     recommended = cube.physical(outcome.trace.recommendations)
     proposed = cube.physical(outcome.trace.proposals)
-    # A recording has no known truth: its errors of parameters are NaN throughout.
+    # A recording has no known true parameters, so its parameter errors are NaN.
     truth = np.full(cube.dim, np.nan) if target.truth is None else target.truth
     errors = np.abs(recommended - truth)
     columns: dict[str, Any] = {"param_error": (errors / cube.training_widths()).mean(axis=1)}
@@ -109,5 +131,5 @@ def _parameter_columns(problem: Problem, target: Target, outcome: Outcome) -> di
 
 
 def _after_start(values: Any) -> Any:
-    """`values` of simulations 1..k behind a NaN for k = 0, before any simulation."""
+    """Prepend NaN, for k = 0 before any simulation, to the values of simulations 1..k."""
     return np.concatenate([[np.nan], values])

@@ -1,5 +1,6 @@
-"""Runs an experiment: tuners x targets x seeds, in worker processes or in this one; every finished
-run is kept the moment it ends.
+"""Run an experiment: tuners x targets x seeds, in worker processes or in this process.
+
+Every run is stored as soon as it has ended.
 """
 
 from __future__ import annotations
@@ -36,45 +37,72 @@ from bench.store.status import Status
 from sims.base import InputError
 
 Progress = Callable[[str, int], Callable[[], None]]
-"""Called with a title and a number of steps; gives the function to call after each step."""
+"""Function that gets a title and a number of steps.
+
+It returns a function that is called after each step.
+"""
 
 
 def silent(_title: str, _steps: int) -> Callable[[], None]:
-    """Progress that nobody looks at."""
+    """Ignore progress."""
     return lambda: None
 
 
 class Keep(Protocol):
-    """Where finished runs go, each by its place in the plan; `statuses` says which there are."""
+    """Storage of finished runs by their index in the plan.
+
+    Attributes:
+        statuses: status of each stored run.
+    """
 
     statuses: dict[int, Status]
 
     def add(self, place: int, columns: Mapping[str, Any], status: Status) -> None:
-        """Keep the rows and the status of a finished run."""
+        """Store the rows and the status of a finished run.
+
+        Args:
+            place: index of the run in the plan.
+            columns: rows of runs.parquet.
+            status: status of the run.
+        """
         ...
 
 
 class Memory:
-    """Keeps runs in memory."""
+    """Storage of finished runs in memory."""
 
     def __init__(self) -> None:
         self.columns: dict[int, Mapping[str, Any]] = {}
         self.statuses: dict[int, Status] = {}
 
     def add(self, place: int, columns: Mapping[str, Any], status: Status) -> None:
-        """Keep the rows and the status of a finished run."""
+        """Store the rows and the status of a finished run.
+
+        Args:
+            place: index of the run in the plan.
+            columns: rows of runs.parquet.
+            status: status of the run.
+        """
         self.columns[place], self.statuses[place] = columns, status
 
 
 @dataclass
 class Results:
-    """A comparison: its problem, its plan once there is one, where its runs are kept, and what
-    training cost.
+    """A comparison while it is running: its problem, plan, stored runs and trainings.
 
-    `spectra` says what each target's data identify, by its name, where that can be asked; `tuned`
-    which tuner lives in a process of its own, by label; `hidden` what it must not reach; `redraws`
-    how many targets were drawn again; `notes` what the runs made now tell the authors of their
-    tuners.
+    Attributes:
+        problem: tuning problem.
+        kept: storage of finished runs.
+        plan: all runs.
+        trainings: result of each training, by tuner label and seed.
+        spectra: Fisher-information spectrum by target name, if it can be computed.
+        skipped: reason by label of each tuner that cannot be used.
+        tuned: specification by label of each tuner that runs in an isolated process.
+        hidden: paths that isolated processes must not access.
+        redraws: number of targets that were drawn again.
+        interrupted: whether the user interrupted the comparison.
+        stopped: why the comparison stopped early; empty if it did not.
+        notes: notes for the authors of tuners, from the runs of this process.
     """
 
     problem: Problem
@@ -94,13 +122,13 @@ class Results:
         self.notes = Notes(self.problem.experiment.isolation)
 
     def training_rows(self) -> list[tuple[str, int, int, float]]:
-        """Rows of training.csv: tuner, seed, simulations, seconds."""
+        """Return rows of training.csv: tuner, seed, simulations, seconds."""
         return [
             (label, seed, t.simulations, t.seconds) for (label, seed), t in self.trainings.items()
         ]
 
     def skipped_rows(self) -> list[dict[str, Any]]:
-        """Rows of status.csv for tuners that could not be used."""
+        """Return rows of status.csv for tuners that could not be used."""
         experiment = self.problem.experiment
         simulator = experiment.simulator
         fixed = {"target": "", "seed": 0, "status": "skipped", "simulations": 0, "seconds": 0.0}
@@ -113,15 +141,20 @@ class Results:
 
 @dataclass(frozen=True)
 class Job:
-    """An order and the target it is for, truth included; stays in the parent process."""
+    """Run request with its target including the true parameters; stays in the parent process."""
 
     order: Order
     target: Target
 
 
 def seeds_of(experiment: Experiment, entry: Entry) -> int:
-    """How many seeds an entry runs: its own number, the experiment's, or one where nothing is
-    random.
+    """Return the number of seeds of an entry.
+
+    It is the entry's or the experiment's number, or one if the tuner is deterministic.
+
+    Args:
+        experiment: configuration of the experiment.
+        entry: entry of the tuner.
     """
     kind = tuners.get(entry.tuner)
     if not (kind.stochastic or kind.learned):
@@ -130,8 +163,10 @@ def seeds_of(experiment: Experiment, entry: Entry) -> int:
 
 
 def check(experiment: Experiment) -> dict[str, str]:
-    """Build every tuner once, so that a fault shows before the work; returns the skipped entries
-    with their reason.
+    """Build every tuner once, so that errors are reported before the work begins.
+
+    Returns:
+        Reason by label of each tuner that is skipped.
     """
     skipped = {}
     for entry in experiment.tuners:
@@ -144,15 +179,15 @@ def check(experiment: Experiment) -> dict[str, str]:
 
 
 def refuse_unreachable(experiment: Experiment, workers: bool = True) -> None:
-    """Refuse classes that exist in this process alone, if other processes are to work with them.
+    """Raise an error for classes that exist in this process only, if other processes need them.
 
-    A worker starts afresh, so that no tuner finds the true parameters in its memory. It loads
-    plugin files and installed packages, and does not import the script or notebook that calls
+    A worker is a new interpreter, so that no tuner finds the true parameters in its memory. It
+    loads plugin files and installed packages, but does not import the script or notebook that calls
     simgap. The same holds for the process of a tuner.
 
     Args:
-        experiment: what is to be run.
-        workers: whether worker processes simulate; else only tuners have processes.
+        experiment: configuration of the experiment.
+        workers: True if worker processes simulate; otherwise only tuners have processes.
 
     Raises:
         InputError: the simulator, a tuner or an effect is such a class.
@@ -170,11 +205,11 @@ def refuse_unreachable(experiment: Experiment, workers: bool = True) -> None:
 
 
 def unreachable(kind: str, name: str, part: type) -> InputError:
-    """The error for a class that worker processes cannot load.
+    """Make the error for a class that worker processes cannot load.
 
     Args:
-        kind: what it is, as ``tuner``.
-        name: under which it is registered.
+        kind: kind of the class, such as ``tuner``.
+        name: name under which it is registered.
         part: the class.
     """
     file = getattr(sys.modules.get(part.__module__), "__file__", None)
@@ -194,20 +229,19 @@ def unreachable(kind: str, name: str, part: type) -> InputError:
 
 @numeric_warnings_silenced()
 def prepare(experiment: Experiment, salt: str | None = None) -> Results:
-    """Check an experiment whole before any work: its simulator, recording, tuners and their
-    options; plan its runs.
+    """Check an experiment completely before any work, and plan its runs.
 
     Args:
-        experiment: what is to be compared; its plugins are known.
-        salt: the secret one that its targets are drawn from; the experiment's own where None.
+        experiment: configuration of the experiment; its plugins are already registered.
+        salt: secret salt from which its targets are drawn; None for the experiment's own.
 
     Raises:
-        InputError: a fault in it.
+        InputError: the experiment, its simulator, recording or tuners have an error.
     """
     if not experiment.tuners:
         remedy = "add a [tuners.NAME] table or choose some"
         raise InputError(f"experiment {experiment.name}: names no tuner; {remedy}")
-    # A limit that this system does not have would crash every single run.
+    # A memory limit that this system does not support would crash every run.
     if experiment.memory:
         limits()
     results = Results(Problem(experiment, salt), skipped=check(experiment))
@@ -217,13 +251,13 @@ def prepare(experiment: Experiment, salt: str | None = None) -> Results:
     drawn = results.problem.targets()
     results.redraws = redraws_of(experiment, drawn)
     results.plan = list(_plan(experiment, entries, drawn))
-    # Workers open their own; what is left to do here needs no simulator for a while.
+    # Workers open their own simulators, and this process does not need one for now.
     results.problem.close()
     return results
 
 
 def _plan(experiment: Experiment, entries: list[Entry], targets: list[Target]) -> Iterator[Job]:
-    """Every run, target by target, so that the time left can be estimated from the time gone."""
+    """Iterate over all runs, target by target, so that the remaining time can be estimated."""
     name = Identities(experiment).run
     for target in targets:
         for entry in entries:
@@ -241,24 +275,25 @@ def run(
     progress: Progress = silent,
     pool: Pool | None = None,
 ) -> None:
-    """Make every run of a prepared experiment that is not kept already; `results.kept` gets each as
-    it ends.
+    """Execute every run of a prepared experiment that is not yet stored.
+
+    Each result is added to `results.kept` as soon as its run ends.
 
     Args:
-        results: from `prepare`.
-        plugins: plugin files that workers need; the caller has made them known in this process.
-        jobs: worker processes; 0 for none, and everything in this one. The results do not depend
-            on their number.
-        progress: told of every step.
-        pool: where to run instead, e.g. on a cluster.
+        results: prepared experiment from `prepare`.
+        plugins: plugin files that workers need; already registered in this process.
+        jobs: number of worker processes; 0 to run everything in this process. The results do not
+            depend on their number.
+        progress: called for every step.
+        pool: pool to use instead, for example of a cluster.
 
     Raises:
-        InputError: workers cannot be had, or a class that they cannot have is wanted.
+        InputError: workers cannot be started, or a class is needed that they cannot load.
     """
     experiment = results.problem.experiment
     if pool is not None or jobs or not experiment.trusted:
         refuse_unreachable(experiment, workers=pool is not None or jobs > 0)
-    # Here are the truths, and a tuner's process may be this user's.
+    # This process has the true parameters, and a tuner's process may run as the same user.
     hidden = nullcontext() if experiment.trusted else memory_hidden()
     with hidden, pool or pool_of(jobs) as workers:
         workers.load(admitted(plugins, results.problem.experiment))
@@ -276,7 +311,7 @@ def _run(results: Results, pool: Pool, progress: Progress) -> None:
     failures = _train(pool, results, progress)
     step = progress("running", len(missing))
     ready: list[int] = []
-    # Runs of a tuner whose training failed stay in the table, as failures.
+    # Runs of a tuner whose training failed remain in the table, as failures.
     for place in missing:
         order = results.plan[place].order
         if (failure := failures.get((order.entry.label, order.seed))) is not None:
@@ -284,7 +319,7 @@ def _run(results: Results, pool: Pool, progress: Progress) -> None:
             step()
         else:
             ready.append(place)
-    # Each outcome is kept before the next is waited for: a kill costs what is under way.
+    # Each outcome is stored before the next one, so that a kill loses running calls only.
     calls = _Calls(results, ready)
     for i, outcome in pool.results(calls, results.problem.experiment.timeout):
         _file(results, ready[i], outcome)
@@ -292,8 +327,9 @@ def _run(results: Results, pool: Pool, progress: Progress) -> None:
 
 
 def _identify(results: Results, progress: Progress) -> None:
-    """Find what each target's data identify; only the parent process can: where there is a truth
-    it takes that.
+    """Compute the Fisher-information spectrum of each target.
+
+    Only the parent process can do this, because it needs the true parameters if there are any.
     """
     problem, targets = results.problem, {job.target.sealed.name: job.target for job in results.plan}
     if not problem.identifiable:
@@ -307,8 +343,9 @@ def _identify(results: Results, progress: Progress) -> None:
 
 
 class _Calls(Sequence[Call]):
-    """The calls for these places of the plan, each made when it is asked for: a million of them
-    would fill memory.
+    """Lazy sequence of calls for places of the plan.
+
+    Each call is created when it is accessed, because a million calls would fill the memory.
     """
 
     def __init__(self, results: Results, places: list[int]) -> None:
@@ -321,7 +358,7 @@ class _Calls(Sequence[Call]):
         results = self._results
         order = results.plan[self._places[i]].order
         order = replace(order, tuned=results.tuned.get(order.entry.label), hidden=results.hidden)
-        # The plan was made before the training, and ids do not depend on where weights lie.
+        # The plan was made before the training; run ids do not depend on the location of weights.
         training = results.trainings.get((order.entry.label, order.seed))
         if training is not None:
             order = replace(order, weights=training.path)
@@ -329,11 +366,13 @@ class _Calls(Sequence[Call]):
 
 
 def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, int], Exception]:
-    """Train every learned entry with each of its seeds; returns the reasons of those that failed.
+    """Train every learned entry with each of its seeds.
+
+    Returns:
+        Exception by label and seed of each training that failed.
 
     Raises:
-        WeightsError: trained weights are there and damaged: the user's to mend, and nothing has
-            been run yet.
+        WeightsError: stored weights are damaged. The user must repair this, and no run has started.
     """
     experiment = results.problem.experiment
     wanted = [
@@ -343,7 +382,7 @@ def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, 
         for seed in range(seeds_of(experiment, entry))
     ]
     failures: dict[tuple[str, int], Exception] = {}
-    # A bar that has nothing to do would stand there for ever.
+    # A progress bar without steps would never end.
     if not wanted:
         return failures
     step = progress("training", len(wanted))
@@ -365,9 +404,9 @@ def _train(pool: Pool, results: Results, progress: Progress) -> dict[tuple[str, 
 
 
 def _file(results: Results, place: int, outcome: Outcome | Exception) -> None:
-    """Keep what a worker gave back: an outcome, or the error that ended it."""
+    """Store the result of a worker: an outcome, or the error that ended the run."""
     problem, job = results.problem, results.plan[place]
-    # Whatever happened, the run gets its rows and its status: a failure is a result too.
+    # Every run gets rows and a status, because a failure is a result too.
     if isinstance(outcome, TimeoutError):
         reason = f"killed past its limit of {problem.experiment.timeout:g} s"
         outcome = unfinished(problem, job.target, "timeout", reason)

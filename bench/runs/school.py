@@ -1,4 +1,4 @@
-"""Lets a tuner train that lives in a process of its own: it simulates here, counted and fenced."""
+"""Train a tuner that lives in an isolated process; its simulations run here and are counted."""
 
 from __future__ import annotations
 
@@ -26,25 +26,28 @@ from methods.base import Practice as Ground
 from sims.base import Array
 
 _STREAM_BYTES = 48
-"""Of a random stream's state, in front of the points that are asked for."""
+"""Size in bytes of the random generator's state before the requested points."""
 _FOREVER = float("inf")
-"""Training takes its time."""
+"""Deadline of a training, in seconds: none."""
 
 
 def school(
     child: Child, practice: Practice, stream: NDArray[np.uint32], watch: Watch | None
 ) -> dict[str, Array]:
-    """Have a tuner learn; returns what it learned.
+    """Train a tuner in its isolated process.
 
     Args:
-        child: the tuner's process.
-        practice: where it trains; counts what is simulated.
-        stream: the seed of its random stream.
-        watch: looks on.
+        child: process of the tuner.
+        practice: training simulator, which counts the simulations.
+        stream: seed of the tuner's random generator.
+        watch: training callback; None for none.
+
+    Returns:
+        Trained arrays by name.
 
     Raises:
         EndedError: the tuner failed.
-        KilledError: its process was killed from outside.
+        KilledError: its process was killed externally.
     """
     given = {"stream": stream.astype(np.int64), "budget": np.array(practice.budget)}
     child.send(b"F", *packed(given), flags=watch is not None, deadline=_FOREVER)
@@ -60,10 +63,10 @@ def school(
 
 
 def _serve(child: Child, message: Message, grounds: list[Ground], watch: Watch | None) -> None:
-    """Answer what a tuner at school asks.
+    """Handle one message of a tuner during its training.
 
     Raises:
-        FoulError: that is no question.
+        FoulError: the message is not valid here.
     """
     if message.kind == b"W" and watch is not None:
         watch.epoch(*_told(message.document()))
@@ -71,7 +74,7 @@ def _serve(child: Child, message: Message, grounds: list[Ground], watch: Watch |
     elif (
         message.kind == b"P" and message.flags < 4 and (watch is not None or not message.flags & 1)
     ):
-        # The second ground only measures, and is there for who looks on.
+        # The second simulator is for evaluation only, and exists only if there is a callback.
         if message.flags & 1 and watch is not None and len(grounds) == 1:
             grounds.append(watch.ground)
         _practise(child, message, grounds[message.flags & 1])
@@ -80,10 +83,10 @@ def _serve(child: Child, message: Message, grounds: list[Ground], watch: Watch |
 
 
 def _told(said: Any) -> tuple[str, int, int, float, float]:
-    """Stage, epoch, epochs, and two losses.
+    """Parse a progress message: stage, epoch, number of epochs, and two losses.
 
     Raises:
-        FoulError: it is something else.
+        FoulError: the message has another content.
     """
     try:
         stage, epoch, epochs, loss, held_out = said
@@ -93,7 +96,7 @@ def _told(said: Any) -> tuple[str, int, int, float, float]:
 
 
 def _practise(child: Child, message: Message, ground: Ground) -> None:
-    """Tell of the ground, and simulate there where that is asked for."""
+    """Send the properties of a simulator, and simulate if the message requests it."""
     result: dict[str, NDArray[Any]] = {}
     if message.flags & 2:
         try:
@@ -115,8 +118,10 @@ def _practise(child: Child, message: Message, ground: Ground) -> None:
 
 
 def _simulated(message: Message, ground: Ground) -> dict[str, NDArray[Any]]:
-    """Observations of the points that are asked for, and the random stream behind the scenario's
-    draw.
+    """Simulate the requested points.
+
+    Returns:
+        The observations, and the state of the random generator after drawing the scenario.
     """
     body = bytes(message.body)
     if len(body) > ASKED_LIMIT or len(body) != _STREAM_BYTES + 8 * message.size * ground.dim:

@@ -1,4 +1,4 @@
-"""What a comparison or a training would need, from its experiment alone; see `bench.sizes`."""
+"""Estimate what a comparison or a training needs, from its experiment alone; see `bench.sizes`."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from bench.sizes import (
 from sims.recording.recording import read_recording
 
 _ROW_DISK = 50
-"""Bytes of a row on disk; 70 were measured."""
+"""Size of a row on disk in bytes; 70 were measured."""
 _ROW_MEMORY = 80
-"""Bytes of a row while table and figures are made; 110 were measured."""
+"""Memory of a row in bytes while tables and figures are made; 110 were measured."""
 _ROW_SECONDS = 1e-6
-"""Seconds to write and read a row."""
+"""Time to write and read a row, in seconds."""
 _RUN_MEMORY = 500
-"""Bytes of a planned run: its order, its id, its status."""
+"""Memory of a planned run in bytes: its request, its id and its status."""
 _RUN_SECONDS = 5e-4
-"""Seconds to score and keep a run."""
+"""Time to score and store a run, in seconds."""
 _PER_PART = 1000
-"""Runs that share a file while a comparison is under way."""
+"""Number of runs that share a file while a comparison is running."""
 _WORKER = 30e6
-"""Bytes of a worker process that it shares with no other."""
+"""Memory of a worker process in bytes that is not shared with other processes."""
 _CLUSTER = 10_000
-"""Workers that a cluster may have."""
+"""Assumed maximum number of workers of a cluster."""
 _TRAINING = 0.1
-"""Seconds that a training takes at the least."""
+"""Minimum duration of a training in seconds."""
 _USUAL: Mapping[str, float] = {
     "targets": 100,
     "seeds": 5,
@@ -52,11 +52,11 @@ _USUAL: Mapping[str, float] = {
     "steps": 2000,
     "jobs": 8,
 }
-"""What experiments have."""
+"""Typical sizes of experiments."""
 
 
 class _Experiment:
-    """The sizes that an experiment's needs are made of."""
+    """Sizes of an experiment from which its needs are computed."""
 
     def __init__(self, experiment: Experiment) -> None:
         problem = Problem(experiment)
@@ -70,17 +70,17 @@ class _Experiment:
 
     @property
     def observation(self) -> float:
-        """Bytes of an observation."""
+        """Size of an observation in bytes."""
         return float(self.samples) * self.channels * NUMBER
 
     @property
     def simulation(self) -> float:
-        """Seconds of a simulation."""
+        """Duration of a simulation in seconds."""
         return SIMULATION + STEP * self.steps
 
 
 def _simulation(problem: Problem) -> tuple[int, float]:
-    """Samples and steps of what is simulated for one evaluation."""
+    """Return the numbers of samples and of time steps that one evaluation simulates."""
     experiment = problem.experiment
     step = min(map(largest_step, (problem.simulator, problem.world)))
     if problem.recording:
@@ -99,21 +99,21 @@ def check_comparison(
     cluster: bool = False,
     force: bool = False,
 ) -> None:
-    """Refuse a comparison that is hopeless on this machine.
+    """Raise an error for a comparison that is not feasible on this machine.
 
     Args:
-        experiment: what it is of; it may sweep over values.
-        folder: where it would be written.
-        jobs: worker processes; 0 for none.
-        cluster: whether others do the work.
-        force: whether the user insists.
+        experiment: configuration; it may sweep over values.
+        folder: result folder.
+        jobs: number of worker processes; 0 for none.
+        cluster: True if a cluster executes the runs.
+        force: True to skip the check.
 
     Raises:
-        InputError: it needs more than there is, in one line.
+        InputError: it needs more than is available, or its recording has anomalies.
     """
     if force:
         return
-    # An answer takes what its limits say, whatever is asked.
+    # A diagnosis is limited by its own time and memory limits.
     if experiment.diagnosis:
         return
     for one in expand(experiment):
@@ -126,9 +126,15 @@ def check_comparison(
 
 
 def comparison(experiment: Experiment, jobs: int = 2, cluster: bool = False) -> Need:
-    """What all runs of an experiment would need; see `check_comparison`."""
+    """Estimate the needs of all runs of an experiment; see `check_comparison`.
+
+    Args:
+        experiment: configuration without a sweep.
+        jobs: number of worker processes; 0 for none.
+        cluster: True if a cluster executes the runs.
+    """
     sizes = _Experiment(experiment)
-    # Of a bounce shot these are its shots with one ball, of which there are a few.
+    # For a bounce shot this counts its shots with one ball; it has only a few balls.
     targets = experiment.targets * len(experiment.ranges)
     each = [(seeds_of(experiment, e), e.budget or experiment.budget) for e in sizes.tuners]
     runs = targets * sum(seeds for seeds, _ in each)
@@ -176,7 +182,7 @@ def comparison(experiment: Experiment, jobs: int = 2, cluster: bool = False) -> 
 
 
 def _change(counts: Mapping[str, float]) -> str:
-    """What to change: whatever is the largest against its usual size."""
+    """Suggest a change: reduce the number that is largest compared with its typical value."""
     largest = max(counts, key=lambda name: counts[name] / _USUAL[name])
     if largest == "steps":
         return "set a longer time_step, or sample a shorter time"
@@ -184,16 +190,16 @@ def _change(counts: Mapping[str, float]) -> str:
 
 
 def check_training(experiment: Experiment, entry: Entry, seeds: int, force: bool = False) -> None:
-    """Refuse trainings that are hopeless on this machine.
+    """Raise an error for trainings that are not feasible on this machine.
 
     Args:
-        experiment: in which is trained.
-        entry: the tuner.
-        seeds: trainings.
-        force: whether the user insists.
+        experiment: configuration of the training.
+        entry: entry of the tuner.
+        seeds: number of trainings.
+        force: True to skip the check.
 
     Raises:
-        InputError: they need more than there is, in one line.
+        InputError: the trainings need more than is available.
     """
     sizes = _Experiment(experiment)
     budget = experiment.training_budget

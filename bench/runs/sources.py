@@ -1,9 +1,8 @@
-"""What makes a run, as hashes: the rooms of this project that do, the sources of classes from
-elsewhere, the recording, and the packages that compute.
+"""Hash everything that determines a run: code, classes, recordings and package versions.
 
-A run's id and the name of a file of trained weights hold these hashes. Whatever made a run and is
-missing here would let one run, or one set of weights, be taken for another, so rooms are whole
-folders, and a class whose source cannot be told is refused.
+The id of a run and the name of a file of trained weights contain these hashes. If something that
+determines a run were missing here, one run or one set of weights could be mistaken for another.
+Therefore whole source folders are hashed, and a class whose source cannot be found is refused.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ from sims.base import InputError
 from sims.engines.compiled import kept
 
 ROOT = Path(__file__).resolve().parents[2]
-"""Where this project's packages lie."""
+"""Root folder of this project's packages."""
 ROOMS = ("methods", "sims", "bench/problem", "bench/runs", "bench/sealing")
-"""Folders whose code makes runs: methods, worlds, and what drives and scores them."""
+"""Source folders that determine runs: tuners, simulators, and the code that drives and scores."""
 SHOT_ROOMS = (*ROOMS, "bench/shot", "bench/gap", "bench/recordings")
-"""Those whose code makes the shots of a bounce shot: its drops, films and explanations too."""
+"""Source folders that determine bounce shots: also drops, films and explanations."""
 EXPLAIN_ROOMS = (*ROOMS, "bench/misspecified", "bench/gap", "bench/recordings")
-"""Those whose code makes a simulator that explain extended, and the runs in it."""
+"""Source folders that determine extended simulators and the runs in them."""
 PACKAGES = (
     "av",
     "botorch",
@@ -52,15 +51,20 @@ PACKAGES = (
     "scipy",
     "torch",
 )
-"""Packages that compute; another version of one may give other numbers."""
+"""Numerical packages; another version of one may give other results."""
 _PLUGIN = "simgap_plugin_"
-"""How the modules of plugin files are called (`bench.registry`)."""
+"""Prefix of the module names of plugin files (`bench.registry`)."""
 _GROUPS = ("simgap.tuners", "simgap.simulators", "simgap.effects", "simgap.diagnosers")
-"""The entry points by which installed plugins register."""
+"""Entry-point groups by which installed plugins register."""
 
 
 def digest(*parts: Any, length: int = 10) -> str:
-    """A short hexadecimal hash of plain values, arrays' bytes among them."""
+    """Return a short hexadecimal hash of plain values; arrays are given as bytes.
+
+    Args:
+        parts: values to hash.
+        length: number of hexadecimal digits.
+    """
     text = json.dumps(parts, sort_keys=True, default=_plainly)
     return hashlib.sha256(text.encode()).hexdigest()[:length]
 
@@ -73,12 +77,17 @@ def _plainly(value: Any) -> Any:
 
 @cache
 def rooms(which: tuple[str, ...] = ()) -> str:
-    """Hash of every file of these rooms; of those whose code makes runs where none is named."""
+    """Hash every file of some source folders; those that determine runs if none are given."""
     return digest(__version__, [_contents(ROOT / room, ROOT) for room in which or ROOMS])
 
 
 def _contents(folder: Path, root: Path) -> list[tuple[str, bytes]]:
-    """Place below `root` and content of each file in a folder, without what Python compiles."""
+    """Return relative path and content of each file in a folder, without compiled Python files.
+
+    Args:
+        folder: folder to read.
+        root: folder to which the paths are relative.
+    """
     files = [
         file
         for file in sorted(folder.rglob("*"))
@@ -89,13 +98,13 @@ def _contents(folder: Path, root: Path) -> list[tuple[str, bytes]]:
 
 @cache
 def versions() -> str:
-    """Hash of the versions of Python and the packages that compute."""
+    """Hash the versions of Python and of the numerical packages."""
     packages = [package_version(name) for name in PACKAGES]
     return digest(platform.python_version(), packages, kept.is_off())
 
 
 def package_version(name: str) -> str:
-    """Name and version of an installed package, or that it is absent."""
+    """Return name and version of an installed package, or a note that it is absent."""
     try:
         return f"{name} {version(name)}"
     except PackageNotFoundError:
@@ -103,12 +112,12 @@ def package_version(name: str) -> str:
 
 
 def plugin_files(plugins: Sequence[str]) -> str:
-    """Hash of the names and contents of plugin files."""
+    """Hash the names and contents of plugin files."""
     return digest([[Path(p).name, Path(p).read_bytes()] for p in plugins])
 
 
 def recording_digest(experiment: Experiment) -> str:
-    """Hash of the recording's two files; empty where the experiment has none."""
+    """Hash the two files of the recording; empty if the experiment has none."""
     if experiment.recording is None:
         return ""
     table = find_recording(experiment.recording.path)
@@ -116,43 +125,48 @@ def recording_digest(experiment: Experiment) -> str:
 
 
 def what_matters(experiment: Experiment, but: Iterable[str]) -> dict[str, Any]:
-    """The configuration without the fields that do not matter to what is asked.
+    """Return the configuration without the fields that do not affect a result.
 
-    A field that is added to `Experiment` matters until somebody gives a reason why it does not.
+    A new field of `Experiment` is included until it is listed with a reason.
+
+    Args:
+        experiment: configuration of the experiment.
+        but: names of the fields that are left out.
     """
     document = experiment.document() | {"name": experiment.name}
     return {name: value for name, value in document.items() if name not in but}
 
 
 def source(kind: type) -> str:
-    """Hash of what a class does, wherever it and the classes that it builds on come from.
+    """Hash the source of a class and of its base classes.
 
-    A class of this project's rooms is told by its name alone, since `rooms` holds their content.
-    One of a plugin file stands for that file, one of an installed plugin for its whole package,
-    one of a notebook's cell or a script for its own text. A class that is made at run time carries
-    ``source_digest``, a text that changes with all that went into it, and may name the classes
-    that it uses besides its bases in ``made_of``.
+    A class of this project's source folders is represented by its name, because `rooms` hashes
+    their content. A class of a plugin file is represented by the file, one of an installed plugin
+    by its whole package, and one of a notebook cell or a script by its own text. A class that is
+    made at run time has the attribute ``source_digest``, a text that changes with everything that
+    determines the class. Its attribute ``made_of`` may list further classes that it uses.
 
     Raises:
-        InputError: it has none of these, so that nobody could tell a changed class from this one.
+        InputError: the source of a class cannot be found.
     """
     return digest([(_name(part), _place(part)) for part in _parts(kind)])
 
 
 def _name(kind: type) -> str:
-    """The full name of a class; how a plugin file's module is called depends on what is loaded."""
+    """Return the full name of a class; the changing module name of a plugin file is replaced."""
     plugin = kind.__module__.startswith(_PLUGIN)
     return f"{'plugin' if plugin else kind.__module__}.{kind.__qualname__}"
 
 
 def _parts(kind: type) -> list[type]:
-    """A class, its bases, and the classes it says it is made of."""
+    """Return a class, its bases, and the classes that it lists in ``made_of``."""
     parts: list[type] = []
     waiting = [kind]
     while waiting:
         for part in waiting.pop().__mro__:
-            # The standard library is in the version of Python. A base that only describes an
-            # interface is found there; a class that a metaclass made merely says it is there.
+            # Classes of the standard library are determined by the version of Python. A base that
+            # only describes an interface is found there. A class that a metaclass made only names
+            # such a module.
             if part in parts or (_of_python(part) and _under_its_name(part)):
                 continue
             parts.append(part)
@@ -170,11 +184,11 @@ def _top(kind: type) -> str:
 
 
 def _under_its_name(kind: type) -> bool:
-    """Whether the module that a class says it is from holds this very class under its name.
+    """Return whether the module that a class names contains this class under its name.
 
-    Only then is the module's text the class's: a function may make many classes from one text,
-    each with other numbers in it, and `abc` is where every class seems to be from that an abstract
-    class's ``type(...)`` made.
+    Only then is the module's source the source of the class. A function may make many classes from
+    one source, each with other values. A class made by ``type(...)`` from an abstract class names
+    `abc` as its module.
     """
     held: Any = sys.modules.get(kind.__module__)
     for name in kind.__qualname__.split("."):
@@ -183,12 +197,12 @@ def _under_its_name(kind: type) -> bool:
 
 
 def _place(kind: type) -> Any:
-    """What stands for a class in a hash: nothing where `rooms` holds it, else its source.
+    """Return the representation of a class in a hash: empty if `rooms` covers it, else its source.
 
     Raises:
-        InputError: nothing does.
+        InputError: there is no source.
     """
-    # Not inherited: a subclass does something else than the class that carries the digest.
+    # The digest is not inherited, because a subclass behaves differently.
     if (own := vars(kind).get("source_digest")) is not None:
         return own
     if not _under_its_name(kind):
@@ -205,12 +219,12 @@ def _place(kind: type) -> Any:
 
 
 def _text(kind: type) -> str:
-    """The text of a class of a notebook's cell or of the script that runs."""
+    """Return the source of a class of a notebook cell or of the main script."""
     try:
         return inspect.getsource(kind)
     except (OSError, TypeError):
         pass
-    # A notebook has no file to look for classes in, but its functions know the text of their cell.
+    # A notebook has no file to search for classes, but functions refer to the text of their cell.
     for function in filter(inspect.isfunction, vars(kind).values()):
         if cell := linecache.getlines(function.__code__.co_filename):
             return "".join(cell)
@@ -218,7 +232,7 @@ def _text(kind: type) -> str:
 
 
 def _package(kind: type, path: Path) -> Any:
-    """The contents of an installed plugin's package, else of the file that a class is in."""
+    """Return the contents of an installed plugin's package, or of the file with the class."""
     top = sys.modules.get(_top(kind))
     if _top(kind) in _installed() and (folders := getattr(top, "__path__", None)):
         return [_contents(Path(folder), Path(folder)) for folder in folders]
@@ -235,29 +249,29 @@ def _untold(kind: type) -> InputError:
 
 @cache
 def _installed() -> frozenset[str]:
-    """Top-level packages of installed plugins, this project's own among them."""
+    """Return the top-level packages of installed plugins, including this project's own."""
     entries = [entry for group in _GROUPS for entry in entry_points(group=group)]
     return frozenset(entry.module.partition(".")[0] for entry in entries)
 
 
 def effect_sources(*settings: Mapping[str, Any]) -> list[str]:
-    """Sources of the effects that settings of a simulator name, which its class does not hold."""
+    """Hash the sources of effects named in simulator settings; the simulator class lacks them."""
     return [source(effects.get(name)) for name in effect_names(*settings)]
 
 
 def effect_names(*settings: Mapping[str, Any]) -> list[str]:
-    """Names of the effects in ``effects`` and ``fixed`` of these settings, each once, sorted."""
+    """Return the sorted names of registered effects in ``effects`` and ``fixed`` of settings."""
     return sorted(named_effects(*settings) & set(effects.names()))
 
 
 def named_effects(*settings: Mapping[str, Any]) -> set[str]:
-    """All names that stand there, of effects that are known and of such as a plugin may have."""
+    """Return all effect names in settings, also those that a plugin may define later."""
     names: set[str] = set()
     for table in settings:
         for key in ("effects", "fixed"):
             value = table.get(key, ())
-            # What is no list, or no effect, is the simulator's to refuse.
+            # Values of a wrong type are reported by the simulator.
             if isinstance(value, Mapping | Sequence) and not isinstance(value, str):
-                # At a place of a robot it is the same effect.
+                # An effect at a place of a robot is the effect without the place.
                 names.update(name.partition("@")[0] for name in value if isinstance(name, str))
     return names

@@ -1,7 +1,7 @@
-"""Drives a registered tuner on any function that simulates, without an experiment around it.
+"""Run a registered tuner on any simulation function, without an experiment.
 
-A part of the harness that only wants good parameters gets them here, under the contract of a
-comparison: the tuner works in the unit cube, within a budget, and sees no more than a target shows.
+Other parts of the project that only need good parameters use this. The rules of a comparison hold:
+the tuner works in the unit cube, within a budget, and has the same information as for a target.
 """
 
 from __future__ import annotations
@@ -20,15 +20,17 @@ from sims.base import Array, InputError, Parameter, UnitCube
 
 @dataclass(frozen=True)
 class Standalone:
-    """What a tuner is to be run on.
+    """Problem to run a tuner on.
 
     Attributes:
-        parameters: what it tunes.
-        start: (b,) where it starts, physical units.
-        observed: (T, C) SI units, runs one behind the other; NaN where a sample is missing.
-        scale: (C,) what a residual is divided by.
-        lengths: samples of each run; they add up to T.
-        evaluate: physical parameters (n, b) -> observations (n, T, C) and losses (n,).
+        parameters: parameters to tune.
+        start: (b,) starting point in physical units.
+        observed: (T, C) observations of all runs in SI units, concatenated; NaN for missing
+            samples.
+        scale: (C,) scale of the residuals of each channel.
+        lengths: number of samples of each run; their sum is T.
+        evaluate: function of physical parameters (n, b) that returns observations (n, T, C) and
+            losses (n,).
     """
 
     parameters: Sequence[Parameter]
@@ -42,20 +44,23 @@ class Standalone:
 def recommended(
     name: str, problem: Standalone, budget: int, seconds: float, rng: np.random.Generator
 ) -> Array:
-    """Parameters (b,) that a registered tuner recommends in the end, physical units.
+    """Return the parameters that a registered tuner recommends at the end of its run.
 
     Args:
-        name: the tuner's, with its default options.
-        problem: what it is run on.
-        budget: simulations that it may use.
+        name: name of the tuner, which runs with its default options.
+        problem: problem to run it on.
+        budget: maximum number of simulations.
         seconds: time limit, checked between evaluations.
-        rng: the run's own generator.
+        rng: random generator of the run.
+
+    Returns:
+        (b,) parameters in physical units.
 
     Raises:
-        InputError: no such tuner, or one that must be trained first.
+        InputError: there is no such tuner, or it must be trained first.
     """
     kind = tuners.get(name)
-    # there is no experiment here that says on what to train
+    # There is no experiment that defines the training.
     if kind.learned:
         raise InputError(
             f"tuner {name} must be trained first; expected one that searches, such as least_squares"
@@ -75,11 +80,19 @@ def recommended(
         lengths=problem.lengths,
     )
     trace = drive(kind(), task, evaluate, rng, seconds)
-    # the last one, whatever the status: a run that failed still recommends where it stood
+    # Even a failed run recommends its last point, so the status is not checked.
     best: Array = cube.physical(trace.recommendations[-1])
     return best
 
 
 def evenly(count: int, dim: int) -> Array:
-    """(count, dim) starting points spread evenly over the unit cube, for who has no tuner begin."""
+    """Return quasi-random starting points in the unit cube.
+
+    Args:
+        count: number of points.
+        dim: number of parameters.
+
+    Returns:
+        (count, dim) points.
+    """
     return spread(count, np.full(dim, 0.5))

@@ -1,5 +1,6 @@
-"""What a plugin file or an installed package holds, found out in a sealed process: its code never
-runs where truths are.
+"""Inspect plugin files and installed plugins in an isolated process.
+
+The code of a plugin with tuners or diagnosers never runs in a process that has true parameters.
 """
 
 from __future__ import annotations
@@ -26,24 +27,24 @@ from sims.extended import read
 from sims.registry import Registry, SkippedError
 
 _PATIENCE = 120.0
-"""Seconds that loading a plugin may take."""
+"""Timeout for loading a plugin, in seconds."""
 _ANSWER = 1 << 20
-"""Bytes that may be said of what it holds."""
+"""Maximum size of the description of a plugin, in bytes."""
 _OWN = ("methods.", "bench.")
-"""The packages of the project's own tuners and diagnosers, which are of the harness's making."""
+"""Packages of the project's own tuners and diagnosers, which are trusted."""
 _METHODS = ("tuner", "diagnoser")
-"""Parts that are compared, and whose code never runs where truths are."""
+"""Kinds of parts that are compared; their code never runs in a process with true parameters."""
 
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plugin file, and what is known of it.
+    """A plugin file and its description.
 
     Attributes:
-        path: of the file.
+        path: path of the file; empty for an installed plugin.
         loaded: whether its code runs in the harness's processes.
-        tuners: what is known of its tuners where it does not: fields of `Announced`.
-        diagnosers: likewise, of its diagnosers.
+        tuners: descriptions of its tuners if it is not loaded, as fields of `Announced`.
+        diagnosers: descriptions of its diagnosers if it is not loaded.
     """
 
     path: str
@@ -53,14 +54,14 @@ class Plugin:
 
 
 class Announced(Tuner):
-    """A tuner whose code is not in this process; what is known of it."""
+    """Stub of a tuner whose code is not in this process, with its description."""
 
     module: ClassVar[str] = ""
     source_digest: ClassVar[str] = ""
 
 
 def announced(known: dict[str, Any]) -> type[Announced]:
-    """The class that stands for a tuner."""
+    """Make the stub class of a tuner from its description."""
     fields: dict[str, Any] = {
         "name": str(known["name"]),
         "stochastic": known["stochastic"] is not False,
@@ -76,18 +77,18 @@ def announced(known: dict[str, Any]) -> type[Announced]:
 
 
 class AnnouncedDiagnoser(Diagnoser):
-    """A diagnoser whose code is not in this process; what is known of it."""
+    """Stub of a diagnoser whose code is not in this process, with its description."""
 
     module: ClassVar[str] = ""
     source_digest: ClassVar[str] = ""
 
     def diagnose(self, case: Case) -> Answer:
-        """Nobody asks it here."""
+        """Raise an error, because a stub cannot diagnose."""
         raise NotImplementedError
 
 
 def announced_diagnoser(known: dict[str, Any]) -> type[AnnouncedDiagnoser]:
-    """The class that stands for a diagnoser."""
+    """Make the stub class of a diagnoser from its description."""
     fields: dict[str, Any] = {
         "name": str(known["name"]),
         "learned": known["learned"] is True,
@@ -101,10 +102,10 @@ def announced_diagnoser(known: dict[str, Any]) -> type[AnnouncedDiagnoser]:
 
 
 def enter(plugins: Iterable[Plugin]) -> None:
-    """Make plugins known to this process: their code, or what is known of them.
+    """Register plugins in this process: load their code, or make stubs of their descriptions.
 
     Raises:
-        InputError: a fault in one.
+        InputError: a plugin has an error.
     """
     plugins = list(plugins)
     load_plugins(plugin.path for plugin in plugins if plugin.loaded)
@@ -118,16 +119,19 @@ def enter(plugins: Iterable[Plugin]) -> None:
 
 
 _admitted: dict[str, Plugin] = {}
-"""What this process knows of plugin files, by their path."""
+"""Plugin files that this process has loaded or inspected, by path."""
 
 
 def admit(paths: Sequence[str], experiment: Experiment) -> None:
-    """Make plugin files known to this process before the experiment's runs: load those whose code
-    may run here, and find out what the others hold.
+    """Load or describe plugin files before an experiment runs.
+
+    Files whose code may run in this process are loaded; the others are inspected in an isolated
+    process.
 
     Args:
-        paths: of the files.
-        experiment: says which simulator and effects are used, and whether its tuners are trusted.
+        paths: plugin files.
+        experiment: configuration, which states the simulator, the effects and whether tuners are
+            trusted.
 
     Raises:
         InputError: a file cannot be used.
@@ -144,10 +148,10 @@ def admit(paths: Sequence[str], experiment: Experiment) -> None:
 
 
 def _extended(paths: Iterable[str]) -> set[str]:
-    """Names of the simulators and effects that extended simulators are made of.
+    """Return the names of the systems and effects of extended simulators.
 
     Args:
-        paths: of plugin files; those of extended simulators end in .toml.
+        paths: plugin files; those of extended simulators end in .toml.
 
     Raises:
         InputError: a file cannot be read.
@@ -161,10 +165,10 @@ def _extended(paths: Iterable[str]) -> set[str]:
 
 
 def _refuse_both(plugins: Iterable[Plugin], experiment: Experiment) -> None:
-    """Refuse to load a file for its world that has one of the experiment's tuners too.
+    """Raise an error if a file with a simulator or effect in use also has a tuner in use.
 
     Raises:
-        InputError: there is one.
+        InputError: there is such a file.
     """
     labels = {entry.tuner: entry.label for entry in experiment.tuners}
     for plugin in plugins:
@@ -182,7 +186,11 @@ def _among_truths(label: str, place: object) -> InputError:
 
 
 def admitted(paths: Sequence[str], experiment: Experiment) -> list[Plugin]:
-    """What other processes are to know of these files, and of installed packages' tuners.
+    """Return what other processes need to know of plugin files and of installed tuners.
+
+    Args:
+        paths: plugin files.
+        experiment: configuration of the experiment.
 
     Raises:
         InputError: a file cannot be used.
@@ -198,11 +206,11 @@ def admitted(paths: Sequence[str], experiment: Experiment) -> list[Plugin]:
 
 
 _packages: dict[str, Plugin] = {}
-"""What this process knows of installed packages' tuners, by their name."""
+"""Descriptions of tuners of installed packages in this process, by name."""
 
 
 def _announce_installed(names: Iterable[str]) -> None:
-    """Find out about tuners of other packages before anybody imports them here."""
+    """Inspect tuners of other packages before they are imported in this process."""
     for name in names:
         if foreign(name):
             with suppress(SkippedError):
@@ -211,12 +219,13 @@ def _announce_installed(names: Iterable[str]) -> None:
 
 
 def unbuildable(entry: Entry) -> bool:
-    """Whether the tuner of an entry must not be built in this process; if so, it has been built in
-    a process of its own.
+    """Return whether an entry's tuner must be built in an isolated process only.
+
+    If so, it has been built there once as a test.
 
     Raises:
-        InputError: it cannot be built, or its code is in this process already.
-        SkippedError: it cannot be used here.
+        InputError: the tuner cannot be built, or its code is already in this process.
+        SkippedError: the tuner cannot be used here.
     """
     _announce_installed([entry.tuner])
     kind, place = tuners.get(entry.tuner), tuners.place(entry.tuner)
@@ -240,11 +249,13 @@ def _build(entry: Entry) -> None:
 
 
 def survey(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]:
-    """Find out what plugin files hold; those that worlds are made of are to be loaded.
+    """Inspect plugin files, and decide which of them to load.
+
+    A file is loaded if it defines a simulator or effect that is needed.
 
     Args:
-        paths: of the files.
-        needed: names of the simulators and effects that are used.
+        paths: plugin files.
+        needed: names of the simulators and effects in use.
 
     Raises:
         InputError: a file cannot be used.
@@ -253,7 +264,7 @@ def survey(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]:
     found = []
     claimed: dict[tuple[str, str], str] = {}
     for path in paths:
-        # An extended simulator is data, and no code of anybody's.
+        # An extended simulator is data and contains no code.
         if path.endswith(".toml"):
             found.append(Plugin(path))
             continue
@@ -268,11 +279,12 @@ def survey(paths: Sequence[str], needed: Iterable[str]) -> list[Plugin]:
 
 
 def _refuse_taken(kind: str, name: str, path: str, claimed: dict[tuple[str, str], str]) -> None:
-    """Refuse a file that says it has a part which is another's, before its code is let in: what it
-    says need not be so.
+    """Raise an error if a name in a file's description is already in use.
+
+    This is checked before the file's code is loaded, because the description may be wrong.
 
     Raises:
-        InputError: the name is taken.
+        InputError: the name is in use.
     """
     for registry in REGISTRIES:
         taken = registry.kind == kind and name in registry.names()
@@ -284,11 +296,15 @@ def _refuse_taken(kind: str, name: str, path: str, claimed: dict[tuple[str, str]
 
 
 def installed(name: str, kind: str = "tuner") -> Plugin:
-    """What is known of a tuner or diagnoser that another package has installed.
+    """Inspect a tuner or diagnoser that another package has installed.
+
+    Args:
+        name: registered name.
+        kind: ``tuner`` or ``diagnoser``.
 
     Raises:
         SkippedError: it cannot be used here.
-        InputError: it cannot even be looked at.
+        InputError: it cannot be inspected.
     """
     known = _asked({"file": "", "kind": kind, "name": name}, name)
     if known and "skipped" in known[0]:
@@ -297,14 +313,19 @@ def installed(name: str, kind: str = "tuner") -> Plugin:
 
 
 def foreign(name: str, registry: Registry[Any] = tuners) -> bool:
-    """Whether a registered part is another package's, and its code not in this process."""
+    """Return whether a registered part belongs to another package and is not loaded here.
+
+    Args:
+        name: registered name.
+        registry: registry of the part.
+    """
     place = registry.entry(name)
     known = registry.place(name) is not None or place is None
     return not known and not str(place).startswith(_OWN)
 
 
 def _asked(question: dict[str, str], what: str) -> list[dict[str, Any]]:
-    """The answer of a sealed process that has loaded what is asked about."""
+    """Return the answer of an isolated process that has loaded the given plugin."""
     file = question["file"]
     if file and not Path(file).is_file():
         raise InputError(f"plugin {file}: no such file")
@@ -332,15 +353,15 @@ def _answer(question: dict[str, str], files: list[str]) -> Any:
 
 
 def _plain(part: Any, file: str) -> dict[str, Any]:
-    """A part of an answer, no more believed than it must be."""
+    """Validate a part of an answer, and convert it to plain values."""
     kinds = [registry.kind for registry in REGISTRIES]
     if not isinstance(part, dict) or part.get("kind") not in kinds or "name" not in part:
         raise InputError(f"plugin {file}: its process did not say what it holds")
     keys = ("kind", "name", "trains_as", "says")
     text = {key: printable(str(part.get(key, ""))[:500]) for key in keys}
-    # The file's own bytes beside what the plugin says of itself.
+    # The hash contains the file's content, in addition to the plugin's own description.
     told = [str(part.get("source", "")), Path(file).read_bytes() if file else b""]
-    # What is found by its file needs no module, and may not pass a text on to its runs.
+    # A part of a file is found by the file; a module name could pass information to its runs.
     module = "" if file else str(part.get("module", ""))
     rest = {"file": file, "module": module, "source": digest(*told)}
     flags = {key: part.get(key) for key in ("stochastic", "learned")}
@@ -349,7 +370,13 @@ def _plain(part: Any, file: str) -> dict[str, Any]:
 
 
 def describe(channel: Channel, _reach: Reach, held: list[str]) -> None:
-    """Answer one question; runs in the sealed process."""
+    """Answer one question about a plugin; runs in the isolated process.
+
+    Args:
+        channel: channel to the harness.
+        _reach: access policy; not used.
+        held: names of the active isolation layers.
+    """
     channel.send_document(b"R", held)
     question = channel.receive().document()
     try:
@@ -361,10 +388,10 @@ def describe(channel: Channel, _reach: Reach, held: list[str]) -> None:
 
 
 def _parts(file: str) -> list[dict[str, Any]]:
-    """What a plugin file defines.
+    """Describe what a plugin file defines.
 
     Raises:
-        InputError: it cannot be loaded.
+        InputError: the file cannot be loaded.
     """
     load_plugins([file])
     path = Path(file).resolve()
@@ -377,7 +404,7 @@ def _parts(file: str) -> list[dict[str, Any]]:
 
 
 def _one(question: dict[str, str]) -> dict[str, Any]:
-    """An installed tuner or diagnoser."""
+    """Describe an installed tuner or diagnoser."""
     kind, name = question["kind"], question["name"]
     try:
         return _told(kind, _REGISTRY_OF[kind].get(name))
@@ -400,7 +427,7 @@ def _told(kind: str, part: Any) -> dict[str, Any]:
             "learned": part.learned,
             "trains_as": getattr(part, "trains_as", ""),
             "source": source(part),
-            # A package may be missing for the part and not for its file.
+            # A package may be missing for the part although its file can be imported.
             "name": _REGISTRY_OF[kind].get(part.name).name,
         }
     except SkippedError as error:

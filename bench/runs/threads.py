@@ -1,4 +1,7 @@
-"""Arithmetic in one thread: processes share the cores, and sums come out the same."""
+"""Limit numerical libraries to one thread.
+
+Processes share the cores, and sums are reproducible with one thread.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""What tells numerical libraries how many threads they may have."""
+"""Environment variables that set the number of threads of numerical libraries."""
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Within the block arithmetic has one thread, as in a worker."""
+    """Limit numerical libraries to one thread within the block, as in a worker."""
     from threadpoolctl import threadpool_limits
 
-    # For libraries that are loaded within the block; threadpoolctl knows those that are there.
+    # The variables are for libraries loaded within the block; threadpoolctl limits loaded ones.
     for name in THREADS:
         os.environ.setdefault(name, "1")
     with threadpool_limits(limits=1):

@@ -1,10 +1,9 @@
-"""Trains learned tuners once for each simulator and seed, and keeps what they learned as plain
-tensors.
+"""Train learned tuners once for each simulator and seed, and cache their weights as arrays.
 
-The file's name is a hash of everything that went in: the code that makes runs, the tuner's and
-simulator's source and options, the training range and scenarios, budget, seed, the versions of the
-packages that compute (`bench.runs.sources`). The file holds the same hash, so that one which was
-put in another's place is noticed. Nothing is ever unpickled.
+The name of a weights file contains a hash of everything that determines the weights: the code that
+makes runs, source and options of the tuner and simulator, the training range and scenarios, budget,
+seed, and the versions of the numerical packages (`bench.runs.sources`). The file contains the same
+hash, so that an exchanged file is detected. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -45,25 +44,30 @@ from sims.base import Array, InputError
 from sims.files import replacing
 
 _COUNTS = "__simulations_and_seconds__"
-"""Name of the array that says what the training cost."""
+"""Name of the array with the cost of the training: simulations and seconds."""
 _KEY = "__key__"
-"""Name of the array that holds the key of what was trained."""
+"""Name of the array with the training key."""
 _REMEDY = "delete it to have it trained again"
-"""What to do with a file that cannot be used; it is never repaired silently."""
+"""Advice for a file that cannot be used; it is never repaired silently."""
 
 
 MADE_AGAIN = "it was killed, and asked for other simulations when it was made again"
-"""What ends one that is not the same again."""
+"""Reason of a run or training that was not reproducible after a kill."""
 
 
 class WeightsError(InputError):
-    """A file of trained weights that cannot be used."""
+    """A file of trained weights cannot be used."""
 
 
 @dataclass(frozen=True)
 class Training:
-    """What one training cost when it was done, and where its tensors lie; `found` where that was
-    earlier.
+    """Result of a training.
+
+    Attributes:
+        path: file of the weights.
+        simulations: number of simulations of the training.
+        seconds: duration of the training in seconds.
+        found: True if the weights were in the cache.
     """
 
     path: Path
@@ -73,21 +77,21 @@ class Training:
 
 
 def build(entry: Entry) -> Tuner:
-    """The tuner of an entry, with its options.
+    """Build the tuner of an entry with its options.
 
     Raises:
-        InputError: an option that the tuner does not have, or a value that it refuses.
+        InputError: the tuner does not have an option, or refuses its value.
     """
     kind = tuners.get(entry.tuner)
     try:
         return kind(**entry.options)
-    # Python says the former of an option that is not there, tuners the latter of a value.
+    # Python raises a TypeError for an unknown option, and tuners a ValueError for a bad value.
     except (TypeError, ValueError) as error:
         raise InputError(f"tuner {entry.label}: {error}") from None
 
 
 def folder() -> Path:
-    """Where trained weights are kept: $SIMGAP_CACHE, else simgap/ in the user's cache folder."""
+    """Return the folder of trained weights: $SIMGAP_CACHE, else simgap/ in the user's cache."""
     if os.environ.get("SIMGAP_CACHE"):
         return Path(os.environ["SIMGAP_CACHE"])
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "simgap"
@@ -122,14 +126,19 @@ NOT_OF_A_TRAINING = {
     "nuisance": "matters to entries that are randomised alone, and is hashed with them",
     "tuners": "who else trains; the key has its own tuner with its options",
 }
-"""Keys of an experiment that change no trained weights, each with the reason; all others do."""
+"""Keys of an experiment that do not change trained weights, each with the reason."""
 
 
 def key(experiment: Experiment, entry: Entry, seed: int) -> str:
-    """The hash of everything that determines the trained weights.
+    """Return the key of a training: a name with a hash of everything that determines the weights.
+
+    Args:
+        experiment: configuration of the training.
+        entry: entry of the tuner.
+        seed: seed of the training.
 
     Raises:
-        InputError: the source of the tuner or the simulator cannot be told.
+        InputError: the source of the tuner or the simulator cannot be found.
     """
     simulator = kind_of(experiment)
     hashed = digest(
@@ -150,13 +159,13 @@ def key(experiment: Experiment, entry: Entry, seed: int) -> str:
 
 @dataclass(frozen=True)
 class Lesson:
-    """One training to make.
+    """Request of one training.
 
     Attributes:
-        entry: the tuner with its options.
-        seed: of the training.
-        tuned: the tuner, to be built in a process of its own; None where it is trusted.
-        hidden: folders that this process must not reach.
+        entry: tuner with its options.
+        seed: seed of the training.
+        tuned: specification of the tuner for an isolated process; None if it is trusted.
+        hidden: folders that this process must not access.
     """
 
     entry: Entry
@@ -165,27 +174,34 @@ class Lesson:
     hidden: tuple[str, ...] = ()
 
     def files(self) -> tuple[Path, ...]:
-        """What must travel with it to another machine."""
+        """Return the files that another machine needs for the training."""
         return (Path(self.tuned.file),) if self.tuned and self.tuned.file else ()
 
     def moved(self, places: Mapping[Path, Path]) -> Lesson:
-        """The same where its files have other places."""
+        """Return the request with other paths of its files.
+
+        Args:
+            places: new path of each file by its present path.
+        """
         return self if self.tuned is None else replace(self, tuned=moved(self.tuned, places))
 
 
 def train(
     experiment: Experiment, lesson: Lesson, watch: Watch | None = None, anew: bool = False
 ) -> Training:
-    """Train, or find trained: the tensors' file and what the training cost when it was done.
+    """Train a tuner, or find its weights in the cache.
 
     Args:
-        experiment: the training ground and budget.
-        lesson: who is trained, and where.
-        watch: looks on, if it comes to training.
-        anew: train even where there are weights, and replace them.
+        experiment: configuration with the simulator and the training budget.
+        lesson: request of the training.
+        watch: training callback; None for none.
+        anew: True to train even if there are weights, and to replace them.
+
+    Returns:
+        File of the weights and cost of the training.
 
     Raises:
-        WeightsError: there is a file, and it is damaged or foreign.
+        WeightsError: there is a file, but it is damaged or belongs to another training.
         EndedError: the tuner failed in its process.
     """
     before: list[str] = []
@@ -200,11 +216,11 @@ def _train(
     path = folder() / f"{name}.npz"
     if path.exists() and not anew:
         simulations, seconds = _checked(path, name)[_COUNTS]
-        # Weights that do not fit must show now, and not in every run.
+        # Weights that do not fit must be reported now, and not in every run.
         _fitting(lesson, path)
         return Training(path, int(simulations), float(seconds), found=True)
     problem = Problem(experiment)
-    # Tuners that train alike share a stream: a comparison of them has the same network.
+    # Tuners with the same `trains_as` share a random stream, so that they have the same network.
     stream = stream_of(
         experiment.name, "fit", tuners.get(entry.tuner).trains_as or entry.tuner, seed
     )
@@ -217,7 +233,7 @@ def _train(
     problem.close()
     if rough is not None:
         rough.close()
-    # Beside the tensors, so that a file that was renamed or exchanged is noticed.
+    # Cost and key are stored with the weights, so that an exchanged file is detected.
     about = {
         _COUNTS: np.array([practice.used, seconds]),
         _KEY: np.frombuffer(name.encode(), dtype=np.uint8),
@@ -227,8 +243,10 @@ def _train(
 
 
 class _Repeated(Practice):
-    """A ground for a training that is made again after a kill and must ask for the same: who could
-    have itself killed would else learn from the budget several times.
+    """Training simulator that checks that a repeated training makes the same requests.
+
+    A training is repeated if its process was killed externally. Otherwise a tuner that causes its
+    own kill could use the budget several times.
     """
 
     def __init__(
@@ -238,10 +256,17 @@ class _Repeated(Practice):
         self._before, self._place = before, 0
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
-        """As of any ground.
+        """Simulate points, see `Practice.simulate`; check them against the requests before a kill.
+
+        Args:
+            rng: random generator.
+            points: (n, dim) points of the unit cube.
+
+        Returns:
+            Observations (n, T, C).
 
         Raises:
-            EndedError: what is asked for is not what was asked for before the kill.
+            EndedError: the request differs from the one before the kill.
         """
         asked = digest(repr(rng.bit_generator.state), np.asarray(points).tobytes())
         if self._place == len(self._before):
@@ -255,7 +280,7 @@ class _Repeated(Practice):
 def _learned_here(
     lesson: Lesson, practice: Practice, stream: NDArray[np.uint32], watch: Watch | None
 ) -> Mapping[str, Array]:
-    """What a trusted tuner learns, in this process."""
+    """Train a trusted tuner in this process, and return its weights."""
     tuner = build(lesson.entry)
     tuner.watch = watch
     tuner.fit(practice, np.random.default_rng(stream), practice.budget)
@@ -265,11 +290,11 @@ def _learned_here(
 def _learned_apart(
     lesson: Lesson, practice: Practice, stream: NDArray[np.uint32], watch: Watch | None
 ) -> Mapping[str, Array]:
-    """What a tuner learns in its own process; what it simulates is counted here."""
+    """Train a tuner in its isolated process, and return its weights; this process simulates."""
     assert lesson.tuned is not None
     with housed(lesson.tuned, lesson.seed, "run", lesson.hidden) as tuner:
         state = school(tuner.child, practice, stream, watch)
-    # By such names the file is written, or says what it holds.
+    # These names are arguments of `np.savez` or reserved in the file.
     taken = {"file", "allow_pickle", _COUNTS, _KEY} & set(state)
     if taken:
         raise EndedError("crashed", f"the tuner learned what cannot be kept by the names {taken}")
@@ -277,10 +302,10 @@ def _learned_apart(
 
 
 def _fitting(lesson: Lesson, path: Path) -> None:
-    """Refuse weights that the tuner cannot take.
+    """Raise an error if the tuner does not accept the weights.
 
     Raises:
-        WeightsError: it cannot.
+        WeightsError: the tuner does not accept the weights.
     """
     if lesson.tuned is None:
         trained(lesson.entry, path)
@@ -298,17 +323,21 @@ def _not_of(path: Path, entry: Entry, why: object) -> WeightsError:
 
 
 def _write(path: Path, arrays: Mapping[str, Array | NDArray[np.uint8]]) -> None:
-    """Write a whole file or none: several processes may train the same."""
+    """Write a file atomically, because several processes may train the same tuner."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as partial, partial.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
 
 def trained(entry: Entry, path: Path) -> Tuner:
-    """The tuner with the tensors of `path`.
+    """Build the tuner of an entry, and load its weights.
+
+    Args:
+        entry: entry of the tuner.
+        path: file of the weights.
 
     Raises:
-        WeightsError: the file is missing, damaged, or foreign.
+        WeightsError: the file is missing, damaged, or of another training.
     """
     tuner = build(entry)
     try:
@@ -319,10 +348,10 @@ def trained(entry: Entry, path: Path) -> Tuner:
 
 
 def weights_of(path: Path) -> dict[str, Array]:
-    """The tensors of a file.
+    """Read the weights of a file.
 
     Raises:
-        WeightsError: the file is missing, damaged, or foreign.
+        WeightsError: the file is missing, damaged, or of another training.
     """
     state = _checked(path, path.stem)
     del state[_COUNTS], state[_KEY]
@@ -330,10 +359,14 @@ def weights_of(path: Path) -> dict[str, Array]:
 
 
 def _checked(path: Path, name: str) -> dict[str, Array]:
-    """The arrays of a file of trained weights.
+    """Read and check the arrays of a weights file.
+
+    Args:
+        path: file of the weights.
+        name: key of the training.
 
     Raises:
-        WeightsError: it is missing, damaged, or was trained for something else than `name`.
+        WeightsError: the file is missing, damaged, or of another training than `name`.
     """
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:

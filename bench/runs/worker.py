@@ -1,9 +1,9 @@
-"""What a worker process does: make one run on one sealed target (training is
-`bench.runs.training.train`).
+"""Execute one run on one target in a worker process.
 
-No true parameter ever enters a worker: it gets `SealedTarget`s and returns traces, which the parent
-scores. No tuner's code enters it either, unless the tuners are trusted: it simulates, counts and
-times, and the tuner lives in a process of its own (`bench.sealing`).
+Trainings are executed by `bench.runs.training.train`. True parameters never enter a worker: it gets
+`SealedTarget`s and returns traces, which the parent process scores. Code of tuners does not enter
+it either, unless the tuners are trusted. The worker simulates, counts and measures time, and the
+tuner lives in its own process (`bench.sealing`).
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from sims.base import Array
 
 @dataclass(frozen=True)
 class Order:
-    """One run to make.
+    """Request of one run.
 
     Attributes:
-        run: its id.
-        entry: the tuner's.
-        seed: of the tuner.
-        target: without its truth.
-        budget: simulations.
-        weights: the file of a learned tuner's tensors.
-        tuned: the tuner, to be built in a process of its own; None where it is trusted.
-        hidden: folders that this process must not reach.
+        run: id of the run.
+        entry: entry of the tuner.
+        seed: seed of the tuner.
+        target: target without its true parameters.
+        budget: number of simulations.
+        weights: file of the weights of a learned tuner; None for none.
+        tuned: specification of the tuner for an isolated process; None if it is trusted.
+        hidden: folders that this process must not access.
     """
 
     run: str
@@ -58,12 +58,16 @@ class Order:
     hidden: tuple[str, ...] = ()
 
     def files(self) -> tuple[Path, ...]:
-        """What must travel with the order to another machine."""
+        """Return the files that another machine needs for the run."""
         plugin = Path(self.tuned.file) if self.tuned and self.tuned.file else None
         return tuple(path for path in (self.weights, plugin) if path is not None)
 
     def moved(self, places: Mapping[Path, Path]) -> Order:
-        """The order where its files have other places."""
+        """Return the request with other paths of its files.
+
+        Args:
+            places: new path of each file by its present path.
+        """
         weights = None if self.weights is None else places[self.weights]
         tuned = None if self.tuned is None else moved(self.tuned, places)
         return replace(self, weights=weights, tuned=tuned)
@@ -71,15 +75,15 @@ class Order:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run did, and how well what it recommended after 0..k simulations fits.
+    """Outcome of one run, with the errors of its recommendations after 0..k simulations.
 
     Attributes:
-        trace: the run.
-        obs_rmse: (k + 1, C) error on the target's own runs, channel units.
-        heldout_rmse: (k + 1, C) error on its held-out runs; None where there are none.
-        seconds: wall-clock time of the run, without the scoring.
-        written: files that the tuner wrote and that were thrown away with its process.
-        import_seconds: that the imports of the tuner's file took before the run.
+        trace: trace of the run.
+        obs_rmse: (k + 1, C) RMS error on the target's fitted runs, in channel units.
+        heldout_rmse: (k + 1, C) RMS error on its held-out runs; None if there are none.
+        seconds: wall-clock time of the run in seconds, without the scoring.
+        written: files that the tuner wrote and that were deleted with its process.
+        import_seconds: time in seconds for imports of the tuner's file before the run.
     """
 
     trace: Trace
@@ -91,15 +95,15 @@ class Outcome:
 
 
 class CheatError(RuntimeError):
-    """A tuner had points simulated behind the harness's back."""
+    """A tuner simulated points without the harness counting them."""
 
 
 _problems: dict[int, tuple[Experiment, Problem]] = {}
-"""The last problem of this process; another would hold a second world open."""
+"""Last problem of this process; several problems would hold several simulators open."""
 
 
 def problem_of(experiment: Experiment) -> Problem:
-    """The problem of an experiment, built once in each process."""
+    """Return the problem of an experiment; it is cached until another one is needed."""
     held = _problems.get(0)
     if held is None or held[0] != experiment:
         release()
@@ -108,26 +112,32 @@ def problem_of(experiment: Experiment) -> Problem:
 
 
 def release() -> None:
-    """Close the problem that this process has kept, and forget it."""
+    """Close the cached problem of this process."""
     for _, problem in _problems.values():
         problem.close()
     _problems.clear()
 
 
 def perform(experiment: Experiment, order: Order) -> Outcome:
-    """Make one run; failures of the tuner or the simulator are a status of its trace.
+    """Execute one run; failures of the tuner or the simulator are a status of its trace.
+
+    Args:
+        experiment: configuration of the experiment.
+        order: request of the run.
 
     Raises:
-        CheatError: more was simulated than the tuner asked the harness for.
-        EndedError: the tuner's process was killed from outside, again and again.
+        CheatError: more points were simulated than the tuner requested from the harness.
+        EndedError: the tuner's process was killed externally several times.
     """
     before: list[Array] = []
     return undisturbed(lambda: _perform(experiment, order, before))
 
 
 class _Repeated:
-    """Simulates what a run asks for, which is made again after a kill and must ask for the same:
-    who could have itself killed would else try until it is lucky.
+    """Evaluator that checks that a repeated run makes the same requests.
+
+    A run is repeated if its process was killed externally. Otherwise a tuner that causes its own
+    kill could repeat its run until the result is good.
     """
 
     def __init__(self, evaluate: Evaluate, before: list[Array]) -> None:
@@ -156,7 +166,7 @@ def _perform(experiment: Experiment, order: Order, before: list[Array]) -> Outco
         lengths=tuple(s.times.size for s in target.fitting.scenarios),
         scene=problem.scene(target.fitting.scenarios),
     )
-    # Scoring and what came before do not count.
+    # Simulations of the scoring and of earlier runs are not counted.
     simulated = problem.simulated
     started = perf_counter()
     written, import_seconds = NOTHING_WRITTEN, 0.0
@@ -167,13 +177,13 @@ def _perform(experiment: Experiment, order: Order, before: list[Array]) -> Outco
         trace, written, import_seconds = _sealed(experiment, order, task, repeated)
     seconds = perf_counter() - started
     beside = problem.simulated - simulated - len(trace.losses)
-    # A simulator that raises has simulated, and nothing came of it.
+    # A simulator that raises an error has counted simulations without a result.
     if beside > 0 and trace.status != "crashed":
         raise CheatError(f"{beside} simulations beside the budget")
     if trace.status == "crashed":
-        # Nobody sees a worker's stderr; without workers the person who wrote the tuner does.
+        # The stderr of a worker is discarded; without workers the author of the tuner sees it.
         sys.stderr.write(trace.reason)
-    # After the run, so that no tuner can have seen them.
+    # Held-out runs are simulated after the run, so that the tuner cannot see them.
     heldout = None
     if target.held_out.scenarios:
         heldout = Evaluator(problem, target.held_out).rmse(
@@ -184,12 +194,12 @@ def _perform(experiment: Experiment, order: Order, before: list[Array]) -> Outco
 
 
 def _names(experiment: Experiment, order: Order) -> tuple[str | int, ...]:
-    """What the run's own random stream depends on."""
+    """Return the names that determine the random stream of the run."""
     return experiment.name, order.entry.tuner, order.target.name, order.seed
 
 
 def _trusted(experiment: Experiment, order: Order, task: Task, evaluate: Evaluate) -> Trace:
-    """A run whose tuner works in this very process."""
+    """Execute a run whose tuner works in this process."""
     entry, weights = order.entry, order.weights
     tuner = build(entry) if weights is None else trained(entry, weights)
     rng = rng_for(*_names(experiment, order))
@@ -200,10 +210,10 @@ def _trusted(experiment: Experiment, order: Order, task: Task, evaluate: Evaluat
 def _sealed(
     experiment: Experiment, order: Order, task: Task, evaluate: Evaluate
 ) -> tuple[Trace, Written, float]:
-    """Make a run whose tuner has a process of its own.
+    """Execute a run whose tuner has an isolated process.
 
     Returns:
-        The run, what the tuner wrote, and the seconds of its imports.
+        The trace, the files that the tuner wrote, and the seconds of its imports.
     """
     assert order.tuned is not None
     state = None if order.weights is None else weights_of(order.weights)
@@ -216,24 +226,28 @@ def _sealed(
             run = Sealed(tuner, stream_of(*names), experiment.timeout)
             trace = drive(run, task, evaluate, rng_for(*names), experiment.timeout)
             written = tuner.child.written()
-            # What failed may have left anything behind.
+            # A failed run may have left the process in any state.
             if trace.status in FAILED:
                 tuner.child.end()
             return trace, written, tuner.import_seconds
     except EndedError as ended:
-        # It never began: it could not be built.
+        # The tuner could not be built, so the run has no simulations.
         trace = drive(Ended(ended), task, evaluate, rng_for(*names))
         return trace, NOTHING_WRITTEN, 0.0
 
 
 @dataclass(frozen=True)
 class Ended:
-    """A tuner that could not be built; its run ends as it begins."""
+    """Tuner that could not be built; its run fails at the start.
+
+    Attributes:
+        error: reason of the failure.
+    """
 
     error: EndedError
 
     def tune(self, _task: Task, _rng: object) -> Steps:
-        """Begin no run.
+        """Fail to start a run.
 
         Raises:
             EndedError: always.

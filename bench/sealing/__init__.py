@@ -1,5 +1,5 @@
-"""The process in which a tuner lives: what it may reach, how it is spoken to, and how it ends.
+"""Isolated tuner processes: access restrictions, message protocol and termination.
 
-A tuner holds a `methods.base.Task` and a pipe. What simulates, counts, times and records is on the
-pipe's other side (`bench.sealing.outside`).
+A tuner has a `methods.base.Task` and a pipe. The code that simulates, counts, measures time and
+records is on the other side of the pipe (`bench.sealing.outside`).
 """

@@ -1,4 +1,4 @@
-"""What a tuner asks for, as arrays."""
+"""Validate arrays that a tuner sends."""
 
 from __future__ import annotations
 
@@ -8,12 +8,17 @@ from methods.base import Array
 
 
 def as_points(asked: object, dim: int, what: str) -> Array:
-    """Proposals or recommendations as a fresh array (n, dim), whatever their numbers are.
+    """Convert proposals or recommendations to a new array (n, dim) of any numbers.
+
+    Args:
+        asked: points from the tuner.
+        dim: number of parameters.
+        what: name of the points, for messages.
 
     Raises:
-        ValueError: they have another shape.
+        ValueError: the points have another shape.
     """
-    # A copy: the tuner may go on using its own.
+    # The array is copied, because the tuner may change its own.
     points = np.array(asked, dtype=np.float64, ndmin=2)
     if points.ndim != 2 or points.shape[1] != dim or not len(points):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The filter of system calls around a tuner's process: what it may ask of the kernel.
+"""Seccomp filter of the system calls of a tuner's process.
 
 Sources: man-pages seccomp(2), capset(2), https://man7.org/linux/man-pages; the numbers of system
 calls: the kernel's ``arch/x86/entry/syscalls/syscall_64.tbl`` and
@@ -53,74 +53,78 @@ _NUMBERS: Mapping[str, Mapping[str, int]] = {
         "cachestat": 451, "memfd_create": 279, "memfd_secret": 447, "mmap": 222,
     },
 }  # fmt: skip
-"""Of the calls that are taken away or judged, by machine.
+"""Numbers of the system calls that are blocked or filtered by argument, by machine.
 
-Times, rights and locks of files that one may only read, and sockets by name, would tell another run
-what this one has found; Landlock leaves all of them free.
+Times, permissions and locks of read-only files, and sockets by name, could pass information from
+one run to another. Landlock does not restrict any of them.
 """
 _ARCHITECTURES = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
-"""AUDIT_ARCH of each machine: a call by another's numbers is none of ours."""
+"""AUDIT_ARCH of each machine; calls with the numbers of another architecture are blocked."""
 _ABSENT = ("clone3", "io_uring_setup")
-"""Calls that libraries try first and do without where the kernel says that it has none."""
+"""Calls that libraries try first, and replace if the kernel reports that they do not exist."""
 _UNCOUNTED = ("memfd_create", "memfd_secret")
-"""Calls that give memory which no limit of a process counts."""
+"""Calls that allocate memory which is not counted by a process's memory limit."""
 _JUDGED = (
     "clone", "socketpair", "capset", "kill", "tgkill", "prctl", "prlimit64", "fcntl", "flock",
     "mmap",
 )  # fmt: skip
-"""Calls whose arguments say whether they are allowed, or that are ours alone."""
+"""Calls that are allowed depending on their arguments, or that only the harness uses."""
 
 
 def drop_capabilities() -> None:
-    """Give up every right of a superuser, also of a namespace's own."""
+    """Give up all capabilities of a superuser, including those in a namespace."""
     version_3 = struct.pack("<Ii", 0x20080522, 0)
     call(_NUMBERS[platform.machine()]["capset"], version_3, bytes(24))
 
 
 _LOAD, _AND, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x54, 0x15, 0x35, 0x45, 0x06
-"""Instructions of a filter: load a word, keep some bits of it, jump where it equals, is at least,
-has a bit; return.
-"""
+"""BPF instructions: load a word, AND, jump if equal, if at least, if a bit is set; return."""
 _ALLOW, _KILL, _FAIL = 0x7FFF0000, 0x80000000, 0x00050000
-"""Verdicts of a filter; with an error's number the last makes the call fail, with 0 it does
-nothing.
+"""Return values of a filter: allow, kill the process, fail the call.
+
+The last one is combined with an error number; with 0 the call does nothing and succeeds.
 """
 _EPERM, _ENOMEM, _ENOSYS = _FAIL | 1, _FAIL | 12, _FAIL | 38
-"""Not permitted; no memory; there is no such call."""
+"""Return values for the errors EPERM, ENOMEM and ENOSYS."""
 _THREAD = 0x00010000
-"""CLONE_THREAD: what is made is a thread of this process."""
+"""CLONE_THREAD: the new task is a thread of this process."""
 _STREAMS = tuple(1 | flags for flags in (0, 0x800, 0x80000, 0x80800))
-"""SOCK_STREAM; a pair of any other kind can be given names."""
+"""SOCK_STREAM with its flags; a pair of sockets of another type can be given names."""
 _LOCKS = (6, 7, 37, 38)
-"""F_SETLK, F_SETLKW and those of open files: there is nobody to lock out, and a lock on a file that
-others read too would tell them something. They do nothing, which suits who is alone.
+"""F_SETLK, F_SETLKW and their forms for open file descriptions (fcntl commands).
+
+They succeed without any effect. A real lock on a file that others read would pass information to
+them, and a process that is alone needs no lock.
 """
 _BACK_DOORS = (8, 10, 15, 1024, 1026, 1036, 1038)
-"""F_SETOWN, F_SETSIG, F_SETOWN_EX, F_SETLEASE, F_NOTIFY and hints about a file: they signal to
-others, or tell them.
+"""Fcntl commands that send signals or information to other processes.
+
+F_SETOWN, F_SETSIG, F_SETOWN_EX, F_SETLEASE, F_NOTIFY and write hints of a file.
 """
 _OF_FILES = {**dict.fromkeys(_LOCKS, _FAIL), **dict.fromkeys(_BACK_DOORS, _EPERM)}
-"""Verdicts on what fcntl is asked for."""
+"""Return values of the filter by fcntl command."""
 _NOBODYS = 0x21
-"""MAP_SHARED and MAP_ANONYMOUS: memory that no limit of a process counts."""
+"""MAP_SHARED and MAP_ANONYMOUS: memory that is not counted by a process's memory limit."""
 _X32 = 0x40000000
-"""From which on calls are numbered of a kind that nobody uses."""
+"""First call number of the x32 interface, which is not used."""
 
 
 def can_filter() -> bool:
-    """Whether `refuse_processes` knows this machine."""
+    """Return whether `refuse_processes` supports this machine."""
     return LINUX and platform.machine() in _ARCHITECTURES and sys.byteorder == "little"
 
 
 def refuse_processes(limited: bool = False) -> None:
-    """Let this process start no other, look into none, signal to none, and reach no network;
-    threads stay.
+    """Install a filter that blocks new processes, signals to others, and the network.
+
+    Threads stay allowed.
 
     Args:
-        limited: whether its memory is, so that none may escape being counted.
+        limited: True if the process has a memory limit; calls that allocate uncounted memory are
+            then blocked too.
 
     Raises:
-        OSError: the kernel does not filter system calls, or this machine's are not known here.
+        OSError: the kernel has no system call filters, or this machine is not supported.
     """
     if not can_filter():
         raise OSError(f"no filter for {platform.machine()}")
@@ -133,19 +137,21 @@ def refuse_processes(limited: bool = False) -> None:
 
 
 Line = tuple[int, int, int, int]
-"""Instruction, lines to skip where it holds, where it does not, its number."""
+"""BPF instruction: opcode, lines to skip if true, lines to skip if false, operand."""
 
 
 def _program(
     architecture: int, numbers: Mapping[str, int], own: int, limited: bool
 ) -> Sequence[Line]:
-    """The filter: a call's number stands at offset 0, its machine at 4, its arguments from 16.
+    """Build the filter program.
+
+    The data have the call number at offset 0, the architecture at 4, and the arguments from 16 on.
 
     Args:
-        architecture: of the machine.
-        numbers: of its calls.
-        own: the number of the process.
-        limited: whether its memory is.
+        architecture: AUDIT_ARCH of the machine.
+        numbers: numbers of its system calls.
+        own: process id of this process.
+        limited: True if the process has a memory limit.
     """
     lines: list[Line] = [
         (_LOAD, 0, 0, 4),
@@ -160,7 +166,7 @@ def _program(
             verdict = _ENOSYS if name in (*_ABSENT, *_UNCOUNTED) else _EPERM
             lines += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, verdict)]
     lines += [
-        # The first argument of clone says what is made: a thread is allowed.
+        # The first argument of clone has a flag for threads, which are allowed.
         (_EQUAL, 0, 4, numbers["clone"]),
         (_LOAD, 0, 0, 16),
         (_ANY_BIT, 1, 0, _THREAD),
@@ -188,13 +194,13 @@ def _program(
 
 
 def _judged(number: int, argument: int, verdicts: Mapping[int, int], otherwise: int) -> list[Line]:
-    """What becomes of a call by the lower half of one of its arguments.
+    """Build the rule for a call that depends on the lower half of one of its arguments.
 
     Args:
-        number: of the call.
-        argument: which, from 0.
-        verdicts: by its value.
-        otherwise: where it has none of these.
+        number: number of the call.
+        argument: index of the argument, from 0.
+        verdicts: return value of the filter by argument value.
+        otherwise: return value for other argument values.
     """
     cases: list[Line] = []
     for value, verdict in verdicts.items():

@@ -1,6 +1,4 @@
-"""Tuners' processes as the harness holds them: the nursery that starts them, and each of them with
-the channel to it.
-"""
+"""Client of the fork server, and handles of the isolated processes that it starts."""
 
 from __future__ import annotations
 
@@ -28,25 +26,28 @@ _START = (
 )
 _PRELOADED = ("numpy.random", "bench.sealing.inside")
 _NUMERICAL = ("OPENBLAS_", "MKL_", "OMP_", "NPY_")
-"""With which the names of variables begin that tell numerical libraries how to compute."""
+"""Prefixes of environment variables that determine how numerical libraries compute."""
 PATIENCE = 60.0
-"""Seconds in which a process must have been started, and a tuner built."""
+"""Timeout in seconds for the start of a process and for building a tuner."""
 _OUTSIDE = (-9, -15)
-"""How who was killed from outside ends: SIGKILL (also the kernel's, short of memory), SIGTERM."""
+"""Exit codes of processes that were killed externally: SIGKILL and SIGTERM.
+
+SIGKILL is also sent by the kernel if memory is exhausted.
+"""
 
 
 _COURTESY = 1.0
-"""Seconds in which a process must have said what it has written."""
+"""Timeout in seconds for a process's report of the files that it has written."""
 _FILES = 1_000_000
-"""Largest number of files that is believed."""
+"""Maximum reported number of files; larger reports are cut to it."""
 
 
 class Written(NamedTuple):
-    """What a tuner has written to the folder that is thrown away with its process.
+    """Files that a tuner has written to the folder that is deleted with its process.
 
     Attributes:
-        files: their number.
-        names: of the first of them.
+        files: number of files.
+        names: names of the first files.
     """
 
     files: int
@@ -57,12 +58,12 @@ NOTHING_WRITTEN = Written(0, ())
 
 
 def _name(said: object) -> str:
-    """The name of a file that can stand in a line."""
+    """Convert a file name to text that fits into one line."""
     return " ".join(printable(str(said)[:100]).split())
 
 
 class Nursery:
-    """Starts tuners' processes; see `bench.sealing.nursery`."""
+    """Client of the fork server that starts tuner processes; see `bench.sealing.nursery`."""
 
     def __init__(self) -> None:
         self._place: folders.Folder | None = folders.new()
@@ -95,11 +96,11 @@ class Nursery:
 
     @property
     def alive(self) -> bool:
-        """Whether it can start another."""
+        """Whether the fork server can start another process."""
         return self._process.poll() is None
 
     def load(self, modules: Iterable[str]) -> None:
-        """Load packages ahead; what a plugin is made of is never among them."""
+        """Preload modules in the fork server; modules of plugins are never preloaded."""
         missing = [name for name in dict.fromkeys(modules) if name not in self._loaded]
         if missing:
             self._ask({"do": "load", "modules": missing})
@@ -112,16 +113,19 @@ class Nursery:
         memory: int = 0,
         hidden: Iterable[str] = (),
     ) -> Child:
-        """Start a process.
+        """Start an isolated process.
 
         Args:
-            service: what it is for, one of `bench.sealing.nursery.SERVICES`.
-            files: that it may read beside Python and its packages.
-            memory: MiB that it may take; 0 for no limit.
-            hidden: folders that it must not reach, beside the working one.
+            service: purpose of the process, one of `bench.sealing.nursery.SERVICES`.
+            files: files that it may read, in addition to Python and its packages.
+            memory: memory limit in MiB; 0 for no limit.
+            hidden: folders that it must not access, in addition to the working directory.
+
+        Returns:
+            Handle of the process.
 
         Raises:
-            KilledError: none can be started any more.
+            KilledError: the fork server is gone.
         """
         to_child, to_us = os.pipe(), os.pipe()
         request = {
@@ -143,12 +147,20 @@ class Nursery:
         return Child(self, keeper, Channel(to_us[0], to_child[1]))
 
     def end(self, keeper: int, kill: bool) -> int | None:
-        """End a process; how it ended by itself, None where it had to be ended."""
+        """End a process.
+
+        Args:
+            keeper: process id of its supervisor.
+            kill: True to kill it at once; False to let it end by itself first.
+
+        Returns:
+            Its exit code; None if it had to be killed.
+        """
         code: int | None = self._ask({"do": "end", "keeper": keeper, "kill": kill})["exit"]
         return code
 
     def empty(self) -> None:
-        """Delete what is in the tuners' folder, which they share where none has its own."""
+        """Delete the content of the folder that processes without their own folder share."""
         for path in Path(self._folder).iterdir():
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)
@@ -156,7 +168,7 @@ class Nursery:
                 path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """End it, and every process that it started."""
+        """End the fork server and every process that it started."""
         atexit.unregister(self.close)
         self._link.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -166,28 +178,28 @@ class Nursery:
         if self._place is not None:
             self._place.remove()
             self._place = None
-        # Workers that have ended by now may have left theirs.
+        # Workers that have ended may have left their folders.
         folders.sweep()
 
 
 def _environment(folder: str) -> dict[str, str]:
-    """All that a tuner's process is told of this one's."""
+    """Return the environment variables of tuner processes."""
     kept = ("PATH", "LANG", "LC_ALL", "LD_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES", "SYSTEMROOT")
     told = {name: os.environ[name] for name in kept if name in os.environ}
-    # Without them a library would compute in another way, and sums would end in other digits.
+    # Libraries would otherwise compute differently, and results would differ in the last digits.
     told |= {name: value for name, value in os.environ.items() if name.startswith(_NUMERICAL)}
-    # Compiled steps are loaded from where they are kept, before anything is shut off.
+    # Compiled steps are loaded from the cache folder before the process is isolated.
     told["SIMGAP_COMPILED"] = "off" if compiled.is_off() else str(compiled.folder())
     one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return {**one, **told, "HOME": folder, "TMPDIR": folder, "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 class Child:
-    """A process that has been started, and the channel to it.
+    """Handle of an isolated process, with the channel to it.
 
     Attributes:
-        channel: to it.
-        seals: that hold, once it is ready.
+        channel: message channel to the process.
+        seals: names of the active isolation layers, once the process is ready.
     """
 
     def __init__(self, nursery_: Nursery, keeper: int, channel: Channel) -> None:
@@ -197,14 +209,14 @@ class Child:
 
     @property
     def alive(self) -> bool:
-        """Whether it has not been ended."""
+        """Whether the process has not been ended."""
         return self._open
 
     def ready(self) -> None:
-        """Wait until it is.
+        """Wait until the process is ready.
 
         Raises:
-            KilledError: it never was.
+            KilledError: the process did not start.
         """
         try:
             self.seals = self.channel.receive(deadline=perf_counter() + PATIENCE).document()
@@ -212,7 +224,14 @@ class Child:
             raise KilledError(f"a tuner's process did not start ({self.end()})") from None
 
     def end(self, kill: bool = True) -> int | None:
-        """End it; how it ended by itself, None where it had to be ended."""
+        """End the process.
+
+        Args:
+            kill: True to kill it at once; False to let it end by itself first.
+
+        Returns:
+            Its exit code; None if it had to be killed, or was ended before.
+        """
         if not self._open:
             return None
         self._open = False
@@ -223,11 +242,15 @@ class Child:
         return code
 
     def receive(self, limit: int = TEXT_LIMIT, deadline: float = float("inf")) -> Message:
-        """The next message of a process that runs a plugin's code.
+        """Receive the next message of the process.
+
+        Args:
+            limit: maximum size of the message in bytes.
+            deadline: latest time, as of `perf_counter`.
 
         Raises:
-            EndedError: it failed, took too long or is gone; the process has been ended.
-            KilledError: it was killed from outside.
+            EndedError: the tuner failed, took too long or is gone; the process may have been ended.
+            KilledError: the process was killed externally.
         """
         try:
             message = self.channel.receive(limit, deadline)
@@ -243,9 +266,9 @@ class Child:
         return message
 
     def written(self) -> Written:
-        """Return what the tuner has written to its folder since this was last asked.
+        """Return the files that the tuner has written to its folder since the last call.
 
-        Nothing where the process does not answer: what it says of itself is a courtesy.
+        The result is empty if the process does not answer; its report is optional.
         """
         if not self._open:
             return NOTHING_WRITTEN
@@ -258,12 +281,19 @@ class Child:
         except (EndedError, KilledError, FoulError):
             return NOTHING_WRITTEN
         except (TypeError, ValueError, LookupError, OverflowError):
-            # JSON, but not what was asked for.
+            # The message is JSON, but has another content.
             return NOTHING_WRITTEN
 
     def send(self, kind: bytes, *parts: bytes | Array, deadline: float, **head: int) -> None:
-        """Send it a message; raises as `receive`."""
-        # An answer before the question would seem to take no time.
+        """Send a message to the process; raises the errors of `receive`.
+
+        Args:
+            kind: kind of the message, one byte.
+            parts: content of the message.
+            deadline: latest time, as of `perf_counter`.
+            head: further fields of the message header.
+        """
+        # An answer sent before its question would seem to take no time.
         if self.channel.spoken_to:
             raise self.foul("it spoke without having been asked")
         try:
@@ -275,7 +305,7 @@ class Child:
             raise self._gone() from None
 
     def foul(self, says: str) -> EndedError:
-        """End it, which said what nobody asked for; the error to raise."""
+        """End a process that violated the protocol, and return the error to raise."""
         self.end()
         return EndedError("crashed", f"the tuner's process broke the pipe: {says}")
 

@@ -1,4 +1,4 @@
-"""How a tuner's process may end a run."""
+"""Errors and texts for the ways in which an isolated process can end."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 import signal
 
 ISOLATED = "tuners run isolated: no files, no processes, no network; use --trust while developing"
-"""What is added to the error of a tuner that the isolation has refused something."""
+"""Note that is added to an error that the isolation of the tuner may have caused."""
 _REFUSED = re.compile(
     r"^[\w.]*(PermissionError|BlockingIOError|FileNotFoundError|Connection\w*Error|gaierror"
     r"|BrokenProcessPool|TerminatedWorkerError)\b"
@@ -14,15 +14,15 @@ _REFUSED = re.compile(
     r"|Resource temporarily unavailable|Function not implemented|No space left on device"
     r"|File too large|Too many open files|can't start new thread|Network is unreachable"
 )
-"""What the line of an exception says where the kernel refused a file, a process or a socket."""
+"""Pattern of exception lines after the kernel refused a file, a process or a socket."""
 
 
 class EndedError(Exception):
-    """A run is over: the tuner failed, or took too long.
+    """A run has ended, because the tuner failed or took too long.
 
     Attributes:
-        status: as in status.csv.
-        reason: in words; a traceback of the tuner's own where it crashed.
+        status: status as in status.csv.
+        reason: reason as text; the tuner's traceback if it crashed.
     """
 
     def __init__(self, status: str, reason: str) -> None:
@@ -30,38 +30,38 @@ class EndedError(Exception):
         self.status, self.reason = status, reason
 
     def __reduce__(self) -> tuple[type[EndedError], tuple[str, str]]:
-        # Workers hand errors over pickled, which calls the class with the message alone.
+        # Workers pickle errors; by default unpickling calls the class with the message alone.
         return EndedError, (self.status, self.reason)
 
 
 def with_isolation(reason: str) -> str:
-    """Return a reason with `ISOLATED` at its end, where the isolation may be the cause.
+    """Return a reason with `ISOLATED` at its end, if the isolation may be the cause.
 
     Args:
-        reason: a traceback of an isolated tuner.
+        reason: traceback of an isolated tuner.
     """
-    # The lines at the margin are those of exceptions; the others are frames and source code.
+    # Lines without indentation are those of exceptions; the others are frames and source code.
     if any(_REFUSED.search(line) for line in reason.splitlines() if line[:1].strip()):
         return f"{reason.rstrip()}; {ISOLATED}"
     return reason
 
 
 def without_isolation(reason: str) -> str:
-    """Return a reason without what `with_isolation` has added."""
+    """Return a reason without the text that `with_isolation` has added."""
     return reason.removesuffix(f"; {ISOLATED}")
 
 
 class KilledError(Exception):
-    """A process was killed from outside, which says nothing about what it was at."""
+    """A process was killed externally, which gives no information about its work."""
 
 
 def how_it_ended(process: str, code: int | None) -> str:
-    """How a process ended, in words.
+    """Describe how a process ended.
 
     Args:
-        process: what it is called.
-        code: its exit code, or minus the number of the signal that killed it; None where it closed
-            its pipe and had to be ended.
+        process: name of the process.
+        code: its exit code, or minus the number of the signal that killed it; None if it closed its
+            pipe and had to be killed.
     """
     if code is None:
         return f"{process} closed its pipe and was ended"

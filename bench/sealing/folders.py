@@ -1,5 +1,6 @@
-"""The folders in which tuners work: each is there for as long as the process that made it, and not
-much longer, however that ends.
+"""Temporary folders of tuner processes; each is deleted when the process that made it has ended.
+
+Folders of killed processes are deleted by the next process that makes one.
 """
 
 from __future__ import annotations
@@ -15,35 +16,35 @@ _PREFIX = "simgap-tuner-"
 
 
 class Folder(NamedTuple):
-    """An empty folder, held by this process.
+    """Temporary folder that is locked by this process.
 
     Attributes:
-        path: of it.
-        lock: a file descriptor; who has it open uses the folder.
+        path: path of the folder.
+        lock: file descriptor with the lock; the folder is in use while it is open.
     """
 
     path: str
     lock: int
 
     def remove(self) -> None:
-        """Delete it, and let go of it."""
+        """Delete the folder and release its lock."""
         shutil.rmtree(self.path, ignore_errors=True)
         os.close(self.lock)
 
 
 def new() -> Folder:
-    """A new folder."""
+    """Create a new locked folder."""
     sweep()
     while True:
         path = tempfile.mkdtemp(prefix=_PREFIX)
         lock = _locked(path, wait=True)
-        # Between the two another process may have taken it for one that nobody uses.
+        # Between creation and lock another process may have removed the folder as unused.
         if lock is not None and os.path.isdir(path):
             return Folder(path, lock)
 
 
 def sweep() -> None:
-    """Delete folders whose processes were all killed before they could."""
+    """Delete the folders of processes that were killed."""
     for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
         lock = _locked(str(path), wait=False)
         if lock is not None:
@@ -51,7 +52,15 @@ def sweep() -> None:
 
 
 def _locked(path: str, wait: bool) -> int | None:
-    """A descriptor with the folder's lock; None where another process has it, or it is gone."""
+    """Lock a folder, and return the file descriptor.
+
+    Args:
+        path: path of the folder.
+        wait: True to wait for the lock.
+
+    Returns:
+        File descriptor; None if another process has the lock, or the folder does not exist.
+    """
     try:
         lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     except OSError:

@@ -1,7 +1,7 @@
-"""The tuner's side of the pipe: builds a tuner, and has it do what the harness asks.
+"""Server in an isolated process: builds a tuner, and executes the requests of the harness.
 
-Nothing here can be trusted by the harness once a plugin's code has run beside it; everything that
-counts is counted on the other side.
+The harness cannot trust this process once a plugin's code runs in it. Everything that counts for
+the results is counted on the harness's side of the pipe.
 """
 
 from __future__ import annotations
@@ -37,13 +37,20 @@ from methods.base import (
 )
 
 _LIMIT = 1 << 40
-"""What the harness sends is not bounded: it is trusted."""
+"""Maximum size of a message from the harness in bytes; practically unlimited, as it is trusted."""
 
 
 def serve(channel: Channel, reach: Reach, held: list[str]) -> None:
-    """Do what is asked until nobody asks any more."""
+    """Serve requests until the harness closes the channel.
+
+    Args:
+        channel: message channel to the harness.
+        reach: access policy of this process.
+        held: names of the active isolation layers.
+    """
     channel.send_document(b"R", held)
-    # Loaded ahead, it would give each run the same numbers to those who use it in place of theirs.
+    # NumPy was preloaded, so code that uses its global generator would get the same numbers in each
+    # run.
     np.random.seed()  # noqa: NPY002
     with suppress(GoneError):
         tuner = None
@@ -58,14 +65,15 @@ def serve(channel: Channel, reach: Reach, held: list[str]) -> None:
             except GoneError:
                 return
             except BaseException:
-                # Also what asks to exit: it is the tuner's doing, and its run's end.
+                # This includes SystemExit: it comes from the tuner and ends its run.
                 _say(channel, traceback.format_exc())
 
 
 def _tell_written(channel: Channel, folder: str, told: set[str]) -> None:
-    """Tell which files the tuner has written to its folder and are not in `told`; add them there.
+    """Report files that the tuner has written and that are not in `told`; add them to `told`.
 
-    Hidden files and compiled Python are left out: libraries write them, and nobody misses them.
+    Hidden files and compiled Python files are left out, because libraries write them and they are
+    not needed.
     """
     new = [path for path in islice(_written(folder), _MOST_FILES) if path not in told]
     told.update(new)
@@ -74,7 +82,7 @@ def _tell_written(channel: Channel, folder: str, told: set[str]) -> None:
 
 
 _MOST_FILES = 10_000
-"""Files that are counted."""
+"""Maximum number of files that are counted."""
 
 
 def _written(folder: str) -> Iterator[str]:
@@ -84,12 +92,12 @@ def _written(folder: str) -> Iterator[str]:
 
 
 def _say(channel: Channel, text: str) -> None:
-    """Tell of a failure; of a long text its end, which says what it was."""
+    """Report a failure; a long text is cut to its end, which has the error."""
     channel.send(b"D", text.encode("utf-8", "replace")[-TEXT_LIMIT // 2 :])
 
 
 def _served(channel: Channel, message: Message, tuner: Tuner | None) -> Tuner | None:
-    """Answer one message; the tuner that there is now."""
+    """Execute the request of one message, and return the present tuner."""
     if message.kind == b"B":
         wanted = message.document()
         tuner = found(wanted)(**wanted["options"])
@@ -107,14 +115,14 @@ def _served(channel: Channel, message: Message, tuner: Tuner | None) -> Tuner | 
 
 
 def found(wanted: dict[str, Any], base: type[Any] = Tuner) -> type[Any]:
-    """The class of a tuner, or of another plugin.
+    """Load the class of a tuner or of another plugin.
 
     Args:
-        wanted: ``name`` of it, and the ``file`` or the ``module`` that it is in.
-        base: what it is derived from.
+        wanted: ``name`` of the class, and its ``file`` or ``module``.
+        base: required base class.
 
     Raises:
-        ImportError: it is not there any more.
+        ImportError: the class is not there any more.
     """
     module = (
         _of_file(wanted["file"]) if wanted["file"] else importlib.import_module(wanted["module"])
@@ -137,14 +145,14 @@ def _of_file(path: str) -> Any:
     if spec is None or spec.loader is None:
         raise ImportError(f"{path}: no Python file")
     module = importlib.util.module_from_spec(spec)
-    # Dataclasses look their module up while they are made.
+    # Dataclasses look up their module when they are made.
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
 
 
 def generator(arrays: dict[str, NDArray[Any]]) -> np.random.Generator:
-    """The run's own random stream; see `bench.problem.seeds`."""
+    """Return the random generator of the run; see `bench.problem.seeds`."""
     return np.random.default_rng(arrays["stream"].astype(np.uint32))
 
 
@@ -172,11 +180,11 @@ def _tune(channel: Channel, message: Message, tuner: Tuner) -> None:
 
 
 def _exchange(channel: Channel, steps: Steps, task: Task) -> NoReturn:
-    """Hand over what is asked for, and back what came of it.
+    """Send proposals to the harness, and evaluations to the tuner.
 
     Raises:
         StopIteration: the tuner stopped.
-        GeneratorExit: the harness wants no more.
+        GeneratorExit: the harness ends the run.
         Exception: the tuner failed.
     """
     dim, used = task.dim, 0
@@ -189,7 +197,7 @@ def _exchange(channel: Channel, steps: Steps, task: Task) -> NoReturn:
             if recommend is not None:
                 recommendation = as_points(recommend, dim, "recommendations")[0]
         points = as_points(asked, dim, "proposals")
-        # One beyond the budget tells the harness all that it asks.
+        # One point beyond the budget is enough for the harness to see that the budget is exceeded.
         points = points[: max(task.budget - used, 0) + 1]
         channel.send(b"A", recommendation, points, flags=len(recommendation) > 0, size=len(points))
         answer = channel.receive(_LIMIT)
@@ -208,7 +216,7 @@ def _exchange(channel: Channel, steps: Steps, task: Task) -> NoReturn:
 
 
 def _stay(processor: int) -> None:
-    """Work on the processor that the harness is on: handing over is quicker there."""
+    """Run on the processor that the harness uses, where alternating is faster."""
     with suppress(OSError, AttributeError):
         os.sched_setaffinity(
             0, {processor} if processor < _ANYWHERE else range(os.cpu_count() or 1)
@@ -216,11 +224,11 @@ def _stay(processor: int) -> None:
 
 
 _ANYWHERE = 254
-"""The number that stands for every processor."""
+"""Processor number that represents all processors."""
 
 
 class _Ground:
-    """The simulator as a learned tuner meets it; all that it does is on the pipe's other side."""
+    """Training simulator of a learned tuner, which simulates on the harness's side of the pipe."""
 
     def __init__(self, channel: Channel, which: int) -> None:
         self._channel, self._which = channel, which
@@ -246,7 +254,7 @@ class _Ground:
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:
         state = rng.bit_generator.state
         plain = state["bit_generator"] == "PCG64"
-        # Another kind of stream gives one of this kind a seed.
+        # A generator of another type seeds a new PCG64 generator, which can be sent.
         sent = state if plain else np.random.PCG64(rng.integers(0, 1 << 62, 4).tolist()).state
         asked = np.array(points, dtype=np.float64)
         asked = asked.reshape(-1, self.dim)
@@ -262,7 +270,7 @@ def _stream(state: Any) -> tuple[bytes]:
 
 
 class _Watch:
-    """Tells the harness how a training goes."""
+    """Training callback that reports progress to the harness."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel

@@ -1,8 +1,7 @@
-"""What Linux can take away from a process, by its system calls; nothing of this is in the standard
-library.
+"""Restrict a process by Linux system calls that the standard library does not provide.
 
 Sources: man-pages landlock(7), namespaces(7), user_namespaces(7), mount_setattr(2), prctl(2),
-https://man7.org/linux/man-pages. The filter of system calls is `bench.sealing.calls`.
+https://man7.org/linux/man-pages. The filter of system calls is in `bench.sealing.calls`.
 """
 
 from __future__ import annotations
@@ -18,21 +17,21 @@ from pathlib import Path
 from typing import Any
 
 LINUX = sys.platform.startswith("linux")
-"""Whether any of this is there at all."""
+"""Whether this system is Linux, which these restrictions need."""
 
 NEW_USER = 0x10000000
-"""CLONE_NEWUSER: root of nothing but what belongs to it."""
+"""CLONE_NEWUSER: new user namespace, with capabilities inside it only."""
 NEW_MOUNTS = 0x00020000
-"""CLONE_NEWNS: folders of its own."""
+"""CLONE_NEWNS: new mount namespace."""
 NEW_IPC = 0x08000000
-"""CLONE_NEWIPC: none of the others' shared memory by name."""
+"""CLONE_NEWIPC: new IPC namespace, without the shared memory of other processes."""
 NEW_NETWORK = 0x40000000
-"""CLONE_NEWNET: no network device."""
+"""CLONE_NEWNET: new network namespace, without network devices."""
 NEW_PROCESSES = 0x20000000
-"""CLONE_NEWPID: children see none but themselves, and die with the first of them."""
+"""CLONE_NEWPID: new process namespace for children, who all end when the first of them ends."""
 
 PR_SET_PDEATHSIG = 1
-"""The signal that a process gets when its parent ends."""
+"""Option of prctl: the signal that a process gets when its parent ends."""
 _PR_SET_DUMPABLE = 4
 _PR_SET_NO_NEW_PRIVS = 38
 
@@ -40,28 +39,28 @@ _LANDLOCK_CREATE = 444
 _LANDLOCK_ADD_RULE = 445
 _LANDLOCK_RESTRICT = 446
 _LANDLOCK_READ = 1 << 0 | 1 << 2 | 1 << 3
-"""Execute (as a library is), read a file, read a folder."""
+"""Landlock rights to execute (as a library is), to read a file, and to read a folder."""
 _LANDLOCK_ALL = ((1, (1 << 13) - 1), (2, 1 << 13), (3, 1 << 14), (5, 1 << 15))
-"""Rights on files by the version that brought them."""
+"""Landlock rights on files, by the version of Landlock that introduced them."""
 _LANDLOCK_OF_A_FILE = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14 | 1 << 15
-"""Those that a rule about a file, and no folder, may name."""
+"""Landlock rights that a rule for a file, not for a folder, may contain."""
 _LANDLOCK_TCP = 0b11
-"""To bind and to connect, since version 4."""
+"""Landlock rights to bind and to connect TCP sockets, since version 4."""
 _LANDLOCK_SCOPE = 0b11
-"""Abstract sockets and signals, since version 6."""
+"""Landlock restrictions of abstract sockets and signals, since version 6."""
 
 
 @cache
 def libc() -> Any:
-    """The C library."""
+    """Return the C library."""
     return ctypes.CDLL(None, use_errno=True)
 
 
 def checked(result: int) -> int:
-    """The result of a call.
+    """Return the result of a call if it succeeded.
 
     Raises:
-        OSError: it failed.
+        OSError: the call failed.
     """
     if result < 0:
         number = ctypes.get_errno()
@@ -72,27 +71,39 @@ def checked(result: int) -> int:
 def call(number: int, *arguments: Any) -> int:
     """Make a system call by its number.
 
+    Args:
+        number: number of the system call.
+        arguments: arguments of the system call.
+
     Raises:
-        OSError: it failed.
+        OSError: the call failed.
     """
     return checked(libc().syscall(ctypes.c_long(number), *arguments))
 
 
 def prctl(option: int, value: Any = 0, further: Any = 0) -> None:
-    """Change what the kernel does with this process.
+    """Change an attribute of this process; the man-page of prctl lists the options.
+
+    Args:
+        option: number of the option.
+        value: first argument.
+        further: second argument.
 
     Raises:
-        OSError: it does not.
+        OSError: the call failed.
     """
     unsigned = ctypes.c_ulong
     checked(libc().prctl(option, unsigned(value), further or unsigned(0), unsigned(0), unsigned(0)))
 
 
 def unshare(flags: int) -> None:
-    """Leave the namespaces of these flags for new ones.
+    """Move this process into new namespaces.
+
+    Args:
+        flags: kinds of the namespaces.
 
     Raises:
-        OSError: the kernel does not let this process.
+        OSError: the kernel does not permit it.
     """
     if not LINUX:
         raise OSError("namespaces need Linux")
@@ -100,15 +111,20 @@ def unshare(flags: int) -> None:
 
 
 def keep_identity(user: int, group: int) -> None:
-    """In a new user namespace: be who one was, so that files belong to whom they did."""
-    # Without this a process without rights may not map its group (user_namespaces(7)).
+    """Map the current uid and gid into the new user namespace, so that file owners stay the same.
+
+    Args:
+        user: effective user id outside.
+        group: effective group id outside.
+    """
+    # Without this, an unprivileged process may not map its group (user_namespaces(7)).
     Path("/proc/self/setgroups").write_text("deny", encoding="ascii")
     Path("/proc/self/uid_map").write_text(f"{user} {user} 1", encoding="ascii")
     Path("/proc/self/gid_map").write_text(f"{group} {group} 1", encoding="ascii")
 
 
 _MS_PRIVATE = 1 << 18 | 1 << 14
-"""MS_PRIVATE and MS_REC: what is mounted here stays here."""
+"""MS_PRIVATE and MS_REC: mounts in this namespace are not visible in others."""
 _MS_CAREFUL = 0b1110
 """MS_NOSUID, MS_NODEV and MS_NOEXEC."""
 
@@ -120,28 +136,33 @@ _READ_ONLY = 0b0011
 
 
 def mount(kind: str, place: str, options: str = "") -> None:
-    """Mount a file system without files of its own, such as tmpfs or proc, in this namespace.
+    """Mount a virtual file system, such as tmpfs or proc, in this mount namespace.
+
+    Args:
+        kind: type of the file system.
+        place: mount point.
+        options: options of the file system.
 
     Raises:
-        OSError: the kernel does not let this process.
+        OSError: the kernel does not permit it.
     """
     _mount(kind, place, _MS_CAREFUL, options)
 
 
 def private_mounts() -> None:
-    """Let nothing that is mounted in this namespace be seen outside.
+    """Make all mounts of this namespace private, so that changes are not visible in others.
 
     Raises:
-        OSError: the kernel does not let this process.
+        OSError: the kernel does not permit it.
     """
     _mount("none", "/", _MS_PRIVATE, "")
 
 
 def read_only_mounts() -> None:
-    """Let nothing be changed on what is mounted in this namespace, not even when a file was read.
+    """Make all mounts of this namespace read-only, including access times of files.
 
     Raises:
-        OSError: the kernel is older than 5.12 or does not let this process.
+        OSError: the kernel is older than 5.12, or does not permit it.
     """
     attributes = struct.pack("<QQQQ", _READ_ONLY, 0, 0, 0)
     size = ctypes.c_size_t(len(attributes))
@@ -156,20 +177,20 @@ def _mount(kind: str, place: str, flags: int, options: str) -> None:
 
 
 def die_with_parent() -> None:
-    """Be killed when the process that started this one ends, however it does."""
+    """Have this process killed when its parent ends for any reason."""
     if LINUX:
         prctl(PR_SET_PDEATHSIG, 9)
 
 
 def hide_memory() -> None:
-    """Let no other process of this user read this one's memory, files or environment."""
+    """Prevent other processes of this user from reading this one's memory, files or environment."""
     if LINUX:
         prctl(_PR_SET_DUMPABLE, 0)
 
 
 @contextmanager
 def memory_hidden() -> Iterator[None]:
-    """Within the block this process is as after `hide_memory`."""
+    """Protect the memory of this process within the block; see `hide_memory`."""
     hide_memory()
     try:
         yield
@@ -179,12 +200,12 @@ def memory_hidden() -> Iterator[None]:
 
 
 def no_new_rights() -> None:
-    """Let nothing that this process starts have more rights than it."""
+    """Prevent this process and its children from gaining privileges."""
     prctl(_PR_SET_NO_NEW_PRIVS, 1)
 
 
 def landlock_version() -> int:
-    """The version of Landlock that the kernel has; 0 for none."""
+    """Return the version of Landlock in the kernel; 0 for none."""
     if not LINUX:
         return 0
     try:
@@ -194,12 +215,14 @@ def landlock_version() -> int:
 
 
 def landlock(readable: Iterable[str], writable: Iterable[str]) -> None:
-    """Let this process and what it starts reach these files and folders and no other; no network
-    by TCP, no signal and no abstract socket beyond them either, where the kernel can refuse those.
+    """Restrict this process and its children to some files and folders, by Landlock.
+
+    Newer versions of Landlock also block TCP connections, signals and abstract sockets to processes
+    outside.
 
     Args:
-        readable: files and folders; those that are not there are left out.
-        writable: likewise, to be read and written.
+        readable: readable files and folders; missing ones are ignored.
+        writable: readable and writable files and folders; missing ones are ignored.
 
     Raises:
         OSError: the kernel has no Landlock.
@@ -210,7 +233,7 @@ def landlock(readable: Iterable[str], writable: Iterable[str]) -> None:
     everything = sum(rights for since, rights in _LANDLOCK_ALL if since <= version)
     network = _LANDLOCK_TCP if version >= 4 else 0
     scope = _LANDLOCK_SCOPE if version >= 6 else 0
-    # Each version lengthened the structure, and the kernel takes the shorter ones.
+    # Each version extended the structure, and the kernel accepts the shorter ones.
     fields = (everything, network, scope)[: 1 + (version >= 4) + (version >= 6)]
     attributes = struct.pack(f"<{len(fields)}Q", *fields)
     size = ctypes.c_size_t(len(attributes))

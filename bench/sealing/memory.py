@@ -1,4 +1,4 @@
-"""A limit on the memory that a process may take."""
+"""Limit the memory of a process."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from sims.base import InputError
 
 @contextmanager
 def memory_limit(mebibytes: int) -> Iterator[None]:
-    """Within the block this process may take so much memory more than it has; 0 is no limit.
+    """Limit the additional memory of this process within the block; 0 for no limit.
 
-    What is asked for beyond it fails (`MemoryError`). Linux counts private writable memory
-    (RLIMIT_DATA), so that mapped files and libraries are free.
+    Allocations beyond the limit fail with `MemoryError`. Linux counts private writable memory
+    (RLIMIT_DATA), so mapped files and libraries are not counted.
 
     Raises:
         InputError: this system has no such limit.
@@ -25,7 +25,7 @@ def memory_limit(mebibytes: int) -> Iterator[None]:
         return
     resource = limits()
     before = resource.getrlimit(resource.RLIMIT_DATA)
-    # Beyond what the process has: how large that is depends on the packages it has loaded.
+    # The limit is relative to the present size, which depends on the packages loaded.
     wanted = _data_bytes() + mebibytes * 2**20
     soft = wanted if before[1] == resource.RLIM_INFINITY else min(wanted, before[1])
     resource.setrlimit(resource.RLIMIT_DATA, (soft, before[1]))
@@ -36,7 +36,7 @@ def memory_limit(mebibytes: int) -> Iterator[None]:
 
 
 def limit_memory(mebibytes: int) -> None:
-    """Let this process take so much memory more than it has, for good; 0 is no limit.
+    """Limit the additional memory of this process permanently; 0 for no limit.
 
     Raises:
         InputError: this system has no such limit.
@@ -48,10 +48,10 @@ def limit_memory(mebibytes: int) -> None:
 
 
 def limits() -> Any:
-    """The module `resource` of a system that limits memory.
+    """Return the module `resource` if this system can limit memory.
 
     Raises:
-        InputError: it does not.
+        InputError: this system has no such limit.
     """
     if not sys.platform.startswith("linux"):
         raise InputError(f"memory: a limit needs Linux, this is {sys.platform}; leave it out")
@@ -61,7 +61,7 @@ def limits() -> Any:
 
 
 def _data_bytes() -> int:
-    """Private writable memory of this process, as RLIMIT_DATA counts it."""
+    """Return the private writable memory of this process in bytes, as RLIMIT_DATA counts it."""
     with open("/proc/self/status", encoding="ascii") as lines:
         for line in lines:
             if line.startswith("VmData:"):

@@ -1,10 +1,10 @@
-"""Where tuners' processes come from: a fresh interpreter that knows nothing, and makes copies of
-itself in a few milliseconds.
+"""Fork server from which tuner processes start in a few milliseconds.
 
-It has loaded numpy, the contract of tuners and such packages as tuners need, and never a line of a
-plugin: what a plugin did here, the next run would inherit. For each request it starts a keeper,
-which puts the seals on that need a parent, and the keeper starts the one that runs the tuner's
-code. Kill the keeper, and all of it is gone.
+It is a new interpreter without any information about the study. It has loaded numpy, the tuner
+interface and packages that tuners need, but never a plugin, because the next run would inherit the
+effects of its code. For each request it forks a supervisor, which sets up the isolation layers that
+need a parent process. The supervisor forks the process that runs the tuner's code. Killing the
+supervisor ends both.
 """
 
 from __future__ import annotations
@@ -28,27 +28,33 @@ from bench.sealing.wire import Channel
 
 _LENGTH = struct.Struct("<I")
 _PATIENCE = 1.0
-"""Seconds in which who has closed its pipe must be gone."""
+"""Timeout in seconds for the end of a process that has closed its pipe."""
 SERVICES = (
     "bench.sealing.inside:serve",
     "bench.runs.survey:describe",
     "bench.diagnosis.inside:serve",
 )
-"""What a child may be for: a function that gets its channel."""
+"""Purposes of isolated processes: functions that get the channel of the process."""
 
 
 def send(link: socket.socket, document: Any, descriptors: tuple[int, ...] = ()) -> None:
-    """Write a request or an answer, and hand over open files with it."""
+    """Send a request or an answer with open files.
+
+    Args:
+        link: socket to the other side.
+        document: JSON content.
+        descriptors: file descriptors to pass.
+    """
     body = json.dumps(document).encode()
     socket.send_fds(link, [_LENGTH.pack(len(body))], descriptors)
     link.sendall(body)
 
 
 def receive(link: socket.socket) -> tuple[Any, list[int]]:
-    """Read one, and the files with it.
+    """Receive a request or an answer with its open files.
 
     Raises:
-        EOFError: the other side is gone.
+        EOFError: the other side has closed the socket.
     """
     head, descriptors, _, _ = socket.recv_fds(link, _LENGTH.size, 2)
     if len(head) < _LENGTH.size:
@@ -64,10 +70,10 @@ def receive(link: socket.socket) -> tuple[Any, list[int]]:
 
 
 def main(descriptor: int) -> None:
-    """Serve requests until the other side is gone.
+    """Serve requests until the other side closes the socket.
 
     Args:
-        descriptor: the socket on which they come.
+        descriptor: file descriptor of the socket.
     """
     link = socket.socket(fileno=descriptor)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -88,15 +94,16 @@ def main(descriptor: int) -> None:
                     children.discard(request["keeper"])
                     send(link, {"exit": _end(request["keeper"], request["kill"])})
     except (EOFError, OSError):
-        # Whoever asked is gone, however it ended: so is all that was done for it.
+        # When the client has ended for any reason, all its processes are ended too.
         for keeper in children:
             _end(keeper, kill=True)
         shutil.rmtree(os.getcwd(), ignore_errors=True)
 
 
 def _load(modules: list[str]) -> None:
-    """Load packages ahead, so that no run need do it; one that cannot be loaded is the run's to
-    say.
+    """Preload modules, so that the runs need not import them.
+
+    An import error is ignored here, because the run will raise it again.
     """
     for name in modules:
         with suppress(Exception), warnings.catch_warnings():
@@ -107,7 +114,11 @@ def _load(modules: list[str]) -> None:
 def _start(
     link: socket.socket, request: dict[str, Any], descriptors: list[int], held: list[str]
 ) -> int:
-    """Start a keeper and, in it, the process that serves the channel; the keeper's number."""
+    """Fork a supervisor that starts a process for a service.
+
+    Returns:
+        Process id of the supervisor.
+    """
     service = request["service"]
     if service not in SERVICES:
         raise ValueError(f"no service {service!r:.80}")
@@ -121,13 +132,13 @@ def _start(
     try:
         _keep(service, descriptors, reach, held)
     finally:
-        # A copy that went on would take itself for the nursery, and clear up after it.
+        # Without the exit, the fork would continue as a second fork server.
         os._exit(1)
     raise AssertionError
 
 
 def _keep(service: str, descriptors: list[int], reach: seals.Reach, held: list[str]) -> NoReturn:
-    """Be a keeper: start the process that serves the channel, and end as it does."""
+    """Act as supervisor: fork the process that runs the service, and exit in the same way."""
     die_with_parent()
     held = [*held, *seals.empty_folder(reach.folder), *seals.own_processes()]
     if child := os.fork():
@@ -136,7 +147,7 @@ def _keep(service: str, descriptors: list[int], reach: seals.Reach, held: list[s
         _, ended = os.waitpid(child, 0)
         _end_as(ended)
     die_with_parent()
-    # Not of the nursery's group: what is done to a group would reach it.
+    # A new session keeps signals to the process's group away from the fork server.
     os.setsid()
     code = 1
     try:
@@ -147,7 +158,7 @@ def _keep(service: str, descriptors: list[int], reach: seals.Reach, held: list[s
 
 
 def _serve(service: str, descriptors: list[int], reach: seals.Reach, held: list[str]) -> None:
-    """Put the last seals on, and be of service."""
+    """Apply the last isolation layers, and run the service."""
     _silence()
     reading, writing = (os.dup2(one, 100 + i) for i, one in enumerate(descriptors))
     os.closerange(3, 100)
@@ -161,12 +172,14 @@ def _serve(service: str, descriptors: list[int], reach: seals.Reach, held: list[
 
 
 def _end_as(ended: int) -> NoReturn:
-    """End this process as another has ended: a number would not tell a signal from an exit by the
-    tuner's own will.
+    """End this process in the same way as another one ended.
+
+    If the other one was killed by a signal, this one kills itself with the same signal, because an
+    exit code could also come from the tuner.
     """
     if os.WIFSIGNALED(ended):
         number = os.WTERMSIG(ended)
-        # A second dump of the same memory helps nobody.
+        # A second core dump of the same memory is not needed.
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         with suppress(OSError, ValueError):
             signal.signal(number, signal.SIG_DFL)
@@ -175,7 +188,7 @@ def _end_as(ended: int) -> NoReturn:
 
 
 def _silence() -> None:
-    """Send what is printed to nowhere, and read nothing."""
+    """Discard output and close the input."""
     nowhere = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
         os.dup2(nowhere, descriptor)
@@ -183,8 +196,15 @@ def _silence() -> None:
 
 
 def _end(keeper: int, kill: bool) -> int | None:
-    """How a keeper's process ended: its code, or minus the number of the signal that killed it;
-    None where it had to be ended.
+    """End the process of a supervisor.
+
+    Args:
+        keeper: process id of the supervisor.
+        kill: True to kill it at once.
+
+    Returns:
+        Its exit code, or minus the number of the signal that killed it; None if it had to be
+        killed.
     """
     with suppress(ProcessLookupError):
         if kill:
@@ -198,7 +218,11 @@ def _end(keeper: int, kill: bool) -> int | None:
 
 
 def _waited(keeper: int) -> int | None:
-    """The end of a keeper; None where it took its time and was killed."""
+    """Wait for a supervisor's end, and kill it after `_PATIENCE`.
+
+    Returns:
+        Its wait status; None if it was killed here.
+    """
     patience = perf_counter() + _PATIENCE
     while perf_counter() < patience:
         gone, ended = os.waitpid(keeper, os.WNOHANG)

@@ -1,4 +1,4 @@
-"""The harness's side of the pipe: a tuner that lives beyond it, and its runs."""
+"""Client for a tuner in an isolated process: the tuner and its runs, as the harness uses them."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from bench.sealing.wire import ASKED_LIMIT, TEXT_LIMIT, FoulError, packed
 from methods.base import Array, Ask, Evaluation, Task
 
 _FAREWELL = 10.0
-"""Seconds in which a tuner must have closed what it holds; no more than its run may take."""
+"""Maximum timeout in seconds for the tuner to close its resources at the end of a run."""
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """Which tuner is to be built.
+    """Specification of a tuner to be built in an isolated process.
 
     Attributes:
-        name: registered.
-        module: that it is in, where it is installed.
-        file: the plugin file that it is in; empty where it is installed.
-        options: of its entry.
-        modules: packages that it needs, to be loaded ahead.
+        name: registered name.
+        module: module of an installed tuner.
+        file: plugin file of the tuner; empty if it is installed.
+        options: options of its entry.
+        modules: packages that it needs, to be preloaded.
     """
 
     name: str
@@ -41,23 +41,28 @@ class Tuned:
 
 
 def moved(tuned: Tuned, places: Mapping[Path, Path]) -> Tuned:
-    """The tuner where its file has another place."""
+    """Return a specification with another path of its file.
+
+    Args:
+        tuned: specification of a tuner.
+        places: new path of each file by its present path.
+    """
     return replace(tuned, file=str(places[Path(tuned.file)])) if tuned.file else tuned
 
 
 class SealedTuner:
-    """A tuner that has been built in its process.
+    """Tuner that has been built in an isolated process.
 
     Args:
-        child: started for it.
-        tuned: which one.
-        state: what it learned, where it learns.
+        child: process of the tuner.
+        tuned: specification of the tuner.
+        state: trained weights of a learned tuner.
 
     Attributes:
-        import_seconds: that building it took, almost all of it for imports of its file.
+        import_seconds: seconds to build the tuner, nearly all for imports of its file.
 
     Raises:
-        EndedError: it cannot be built; the process has been ended, or is to be.
+        EndedError: the tuner cannot be built; the caller has to end the process if it still runs.
     """
 
     def __init__(
@@ -86,12 +91,12 @@ class SealedTuner:
 
 @dataclass(frozen=True)
 class Sealed:
-    """A sealed tuner about to make one run; `tune` as of a tuner here.
+    """Isolated tuner for one run, with the method `tune` of a tuner.
 
     Attributes:
-        tuner: in its process.
-        stream: the seed of the run's random stream.
-        seconds: after which it is ended.
+        tuner: isolated tuner.
+        stream: seed of the run's random generator.
+        seconds: time limit of the run.
     """
 
     tuner: SealedTuner
@@ -99,14 +104,17 @@ class Sealed:
     seconds: float
 
     def tune(self, task: Task, _: np.random.Generator) -> SealedSteps:
-        """Begin the run; its random numbers are drawn on the other side."""
+        """Start the run; its random numbers are drawn in the isolated process.
+
+        Args:
+            task: task of the target.
+            _: not used.
+        """
         return SealedSteps(self.tuner.child, task, self.stream, self.seconds)
 
 
 class SealedSteps:
-    """A tuner's run beyond the pipe: `next`, `send` and `close` as of a generator of
-    `methods.base.Steps`.
-    """
+    """Run of an isolated tuner, with the methods of the generator `methods.base.Steps`."""
 
     def __init__(
         self, child: Child, task: Task, stream: NDArray[np.uint32], seconds: float
@@ -137,9 +145,9 @@ class SealedSteps:
         return self._asked()
 
     def send(self, evaluation: Evaluation) -> Array | Ask:
-        """Hand an evaluation over; what is asked for next."""
+        """Send an evaluation, and return the next proposal."""
         flags = self._pace.step()
-        # Until it asks again: where this fails, its process has been ended.
+        # False until the next proposal: if this fails, the process has been ended.
         self._waits = False
         self._child.send(
             b"E",
@@ -170,7 +178,7 @@ class SealedSteps:
         return numbers.reshape(n, dim)
 
     def close(self) -> None:
-        """End the run; the process may serve another.
+        """End the run; the process may serve another one.
 
         Raises:
             EndedError: the tuner failed while it was closed.

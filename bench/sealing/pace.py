@@ -1,4 +1,4 @@
-"""On which processor the two sides of a run work."""
+"""Pin the two sides of a run to one processor while they alternate quickly."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import os
 from time import perf_counter
 
 _QUICK = 5e-4
-"""Seconds of an exchange below which it matters where the two sides work."""
+"""Duration of an exchange in seconds below which both sides should share a processor."""
 _LOOK = 16
-"""Exchanges that are measured before that is decided."""
+"""Number of exchanges that are measured before a decision."""
 _AGAIN = 1.0
-"""Seconds after which it is decided anew: other work may have come to the processor."""
+"""Seconds after which the decision is repeated, because other work may use the processor."""
 
 
 class Pace:
-    """Keeps both sides on one processor where they take turns quickly: waking another one up costs
-    more than the work.
+    """Controller that pins both sides of a run to one processor while they alternate quickly.
 
-    Left to itself the kernel spreads the two, which costs 60 us an exchange; on one processor it
-    is 8 us. For slow exchanges nothing is gained, and the kernel knows better.
+    For fast exchanges, waking another processor costs more than the work. The kernel by default
+    uses two processors, which costs 60 us per exchange; on one processor it is 8 us. For slow
+    exchanges there is no gain, and the choice is left to the kernel.
     """
 
     def __init__(self) -> None:
@@ -28,7 +28,10 @@ class Pace:
         self._pinned = False
 
     def step(self) -> int:
-        """Count an exchange; the flags that tell the other side where to work, 0 for as before."""
+        """Count an exchange, and return flags that tell the other side where to run.
+
+        0 means no change, 255 any processor, and n + 1 processor n.
+        """
         self._count += 1
         if self._count % _LOOK:
             return 0
@@ -51,14 +54,14 @@ class Pace:
         return processor + 1
 
     def release(self) -> None:
-        """Let this side work anywhere again."""
+        """Allow this side to run on its original processors again."""
         if self._pinned and self._home is not None:
             os.sched_setaffinity(0, self._home)
             self._pinned = False
 
 
 def _processor() -> int:
-    """The one that this process is on; -1 where that is not known."""
+    """Return the number of the processor that runs this process; -1 if unknown."""
     try:
         return int(ctypes.CDLL(None).sched_getcpu())
     except (AttributeError, OSError):

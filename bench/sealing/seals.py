@@ -1,8 +1,8 @@
-"""The seals around a tuner's process: which there are, what each keeps it from, and how they are
-put on.
+"""Isolation layers around a tuner's process: what each one prevents, and how it is applied.
 
-Every seal is put on where the kernel lets it, and which hold is known afterwards: Landlock and the
-filter of system calls need nothing but Linux, namespaces may be forbidden to users without rights.
+Each layer is applied if the kernel permits it, and the active layers are reported. Landlock and the
+filter of system calls need nothing but Linux; namespaces may be forbidden to users without
+privileges.
 """
 
 from __future__ import annotations
@@ -29,36 +29,36 @@ SEALS = {
     "memory": "nobody reads the harness's memory (user namespace, not dumpable)",
     "names": "it shares no memory, queue or semaphore by name (IPC namespace)",
 }
-"""What each seal keeps a tuner from, in the order in which they are listed."""
+"""Isolation layers with what each one does, in the order of listings."""
 
 FOLDER_BYTES = 64 << 20
-"""What a tuner's own folder can hold."""
+"""Size of a tuner's own folder in bytes."""
 _FILES = 512
-"""Files that it may hold open."""
+"""Maximum number of open files of a tuner."""
 _THREADS = 1024
-"""Threads that a user's tuners may have; a superuser's are not counted."""
+"""Maximum number of threads of a user's tuners; those of a superuser are not counted."""
 
 ROOT = Path(__file__).resolve().parents[2]
-"""Where this project's packages lie."""
+"""Root folder of this project's packages."""
 _ROOMS = ("bench", "methods", "sims", "simgap.py")
-"""What a tuner may import of this project; its results and tests lie beside them."""
+"""Parts of this project that a tuner may import; results and tests in the same folder are not."""
 _SYSTEM = (
     "/usr", "/lib", "/lib64", "/lib32", "/etc/ld.so.cache", "/etc/localtime", "/dev/urandom",
     "/dev/random", "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat",
     "/sys/devices/system/cpu", "/sys/devices/system/node",
 )  # fmt: skip
-"""What Python and numerical libraries read of a machine."""
+"""Paths of the system that Python and numerical libraries read."""
 _DEVICES = ("/dev/null", "/dev/zero", "/dev/nvidia0", "/dev/nvidiactl", "/dev/nvidia-uvm")
-"""What they write to: nothing, and a graphics card."""
+"""Devices that they write to: null devices and a graphics card."""
 
 
 class Reach(NamedTuple):
-    """What a tuner's process may reach.
+    """Access policy of a tuner's process.
 
     Attributes:
-        folder: its own, empty.
-        readable: files and folders.
-        memory: MiB that it may take beside what it begins with; 0 for no limit.
+        folder: its own empty folder.
+        readable: readable files and folders.
+        memory: limit of additional memory in MiB; 0 for no limit.
     """
 
     folder: str
@@ -67,13 +67,13 @@ class Reach(NamedTuple):
 
 
 def readable(hidden: tuple[str, ...]) -> tuple[str, ...]:
-    """Files and folders that Python, its packages and this project's code need.
+    """Return the files and folders that Python, its packages and this project's code need.
 
     Args:
-        hidden: folders that must not be reached, such as the one of the results; a folder of
-            packages that one of them lies in is left out.
+        hidden: folders that must not be accessible, such as the one of the results; a folder of
+            packages that contains one of them is left out.
     """
-    # A notebook may have added a folder since.
+    # A notebook may have added a folder to the path since the last call.
     return _readable(hidden, tuple(sys.path))
 
 
@@ -94,8 +94,10 @@ def _readable(hidden: tuple[str, ...], packages: tuple[str, ...]) -> tuple[str, 
 
 
 def leave_the_world() -> list[str]:
-    """Leave the user's rights, the network and shared memory; what this process starts has none of
-    them either. Says which seals hold.
+    """Enter new user, network and IPC namespaces; children inherit them.
+
+    Returns:
+        Names of the active isolation layers.
     """
     user, group = os.geteuid(), os.getegid()
     held = []
@@ -103,7 +105,7 @@ def leave_the_world() -> list[str]:
         lambda: kernel.keep_identity(user, group)
     ):
         held.append("memory")
-    # A superuser can leave these without the first.
+    # A superuser can enter these namespaces without a user namespace.
     if _put_on(lambda: _leave(kernel.NEW_NETWORK)):
         held.append("network")
     if _put_on(lambda: _leave(kernel.NEW_IPC)):
@@ -112,12 +114,17 @@ def leave_the_world() -> list[str]:
 
 
 def empty_folder(folder: str) -> list[str]:
-    """Give this process and what it starts an empty folder in memory; says whether that holds."""
+    """Mount an empty folder in memory for this process and its children.
+
+    Returns:
+        Names of the active isolation layers.
+    """
 
     def put() -> None:
         _leave(kernel.NEW_MOUNTS)
         kernel.private_mounts()
-        # Before its own folder, which it may write to; times and rights of files would tell others.
+        # This comes before the mount of its own writable folder. File times and permissions could
+        # pass information to other runs.
         _put_on(kernel.read_only_mounts)
         kernel.mount("tmpfs", folder, f"size={FOLDER_BYTES},nr_inodes=4096,mode=700")
 
@@ -125,25 +132,32 @@ def empty_folder(folder: str) -> list[str]:
 
 
 def own_processes() -> list[str]:
-    """Let the next process that this one starts be the first of its world; says whether it will."""
+    """Enter a new process namespace, in which the next child is the first process.
+
+    Returns:
+        Names of the active isolation layers.
+    """
     return ["processes"] if _put_on(lambda: _leave(kernel.NEW_PROCESSES)) else []
 
 
 def shut(reach: Reach, own_user: bool) -> list[str]:
-    """Take from this process, for good, what is left; says which seals hold.
+    """Apply the remaining restrictions to this process permanently.
 
     Args:
-        reach: what it may reach.
-        own_user: whether it has a user namespace.
+        reach: access policy.
+        own_user: True if the process has a user namespace.
+
+    Returns:
+        Names of the active isolation layers.
     """
     held = []
-    # One's own; where it cannot be had, the files seal leaves of the other one's no more than this.
+    # If its own /proc cannot be mounted, Landlock allows only this process's part of the old one.
     _put_on(lambda: kernel.mount("proc", "/proc"))
     os.chdir(reach.folder)
     _limit(own_user)
-    # Before the files seal: without a /proc of its own it may be refused to look into itself.
+    # This comes before Landlock, which may deny this process access to its own /proc entries.
     limit_memory(reach.memory)
-    # Short of memory the kernel ends the tuner first, and no rival.
+    # If memory is exhausted, the kernel kills the tuner first, and no other process.
     _put_on(lambda: _write("/proc/self/oom_score_adj", "1000"))
     if _put_on(lambda: kernel.landlock(reach.readable, [reach.folder, *_DEVICES])):
         held.append("files")
@@ -162,7 +176,7 @@ def _write(path: str, text: str) -> None:
 
 
 def _put_on(seal: Callable[[], None]) -> bool:
-    """Whether a seal could be put on."""
+    """Return whether an isolation layer could be applied."""
     try:
         seal()
     except (OSError, KeyError, AttributeError):
@@ -171,7 +185,7 @@ def _put_on(seal: Callable[[], None]) -> bool:
 
 
 def _limit(own_user: bool) -> None:
-    """No dumps, few files, and few threads where a user's are counted apart."""
+    """Limit core dumps, open files and file sizes, and threads if they are counted separately."""
     wanted = {
         resource.RLIMIT_CORE: 0,
         resource.RLIMIT_NOFILE: _FILES,
@@ -185,6 +199,6 @@ def _limit(own_user: bool) -> None:
 
 
 def listed(held: Iterable[str]) -> list[str]:
-    """The seals that hold, in the order of `SEALS`."""
+    """Return the active isolation layers in the order of `SEALS`."""
     there = {"process", *held}
     return [name for name in SEALS if name in there]

@@ -1,4 +1,4 @@
-"""Random streams as plain numbers, to go through a pipe."""
+"""Convert the state of a random generator to integers that can be sent through a pipe."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def stream_of(state: Any) -> NDArray[np.int64]:
-    """The state of a PCG64 generator as six whole numbers."""
+    """Return the state of a PCG64 generator as six integers."""
     inner, mask = state["state"], (1 << 64) - 1
     wide = [part for n in (inner["state"], inner["inc"]) for part in (n & mask, n >> 64)]
     whole = np.array([*wide, state["has_uint32"], state["uinteger"]], dtype="<u8")
@@ -17,14 +17,13 @@ def stream_of(state: Any) -> NDArray[np.int64]:
 
 
 def state_of(stream: NDArray[Any]) -> dict[str, Any]:
-    """The state of a PCG64 generator from `stream_of`.
+    """Return the state of a PCG64 generator from the integers of `stream_of`.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the integers are not a valid state.
     """
     low, high, low_step, high_step, has, held = (int(n) & (1 << 64) - 1 for n in stream)
-    # With an even step a stream can stand still, and who draws from it until a number fits would
-    # never end.
+    # With an even increment the stream may be constant, and rejection sampling would never end.
     if has not in (0, 1) or held >> 32 or not low_step & 1:
         raise ValueError("no state of a random stream")
     inner = {"state": high << 64 | low, "inc": high_step << 64 | low_step}

@@ -1,9 +1,8 @@
-"""What goes through the pipe between the harness and a tuner's process: plain arrays and JSON,
-never objects.
+"""Message protocol of the pipes between the harness and a tuner's process: arrays and JSON.
 
-A message is a head (kind, flags, size, length of what follows) and bytes. Each side speaks when it
-has been spoken to. The tuner's side may write whatever it likes: what is no message ends its run,
-and lengths are bounded before anything is allocated.
+Objects are never sent. A message has a head (kind, flags, size, length of the body) and a body.
+Each side sends only in response to the other. The tuner's side may write anything: an invalid
+message ends its run, and lengths are checked before memory is allocated.
 """
 
 from __future__ import annotations
@@ -22,43 +21,43 @@ from numpy.typing import NDArray
 from methods.base import Array
 
 _HEAD = struct.Struct("<cBxxIQ")
-"""Kind, flags, size, bytes that follow."""
+"""Head of a message: kind, flags, size, number of bytes in the body."""
 _BUFFER = 1 << 20
-"""Bytes that are read at once."""
+"""Maximum number of bytes per read."""
 _TYPES = ("<f8", "<f4", "<i8", "<i4", "|u1", "|b1")
-"""Of arrays that a tuner may have learned."""
+"""Permitted types of the arrays of a trained tuner."""
 _ARRAYS = 10_000
-"""How many it may have."""
+"""Maximum number of arrays in a message."""
 _NAMES = 1 << 20
-"""Bytes that their names and shapes may take."""
+"""Maximum size of the names and shapes of the arrays in bytes."""
 
 _LONGEST = float((1 << 31) - 1)
-"""Milliseconds that the kernel waits at most."""
+"""Maximum timeout of `poll` in milliseconds."""
 
 TEXT_LIMIT = 1 << 16
-"""Bytes of a message that is text."""
+"""Maximum size of a text message in bytes."""
 ASKED_LIMIT = 1 << 28
-"""Bytes of proposals."""
+"""Maximum size of proposals in bytes."""
 STATE_LIMIT = 1 << 31
-"""Bytes of what was learned."""
+"""Maximum size of trained weights in bytes."""
 
 
 class GoneError(Exception):
-    """The other side has ended."""
+    """The process on the other side has ended."""
 
 
 class FoulError(Exception):
-    """The other side said what is no message, or more than was asked."""
+    """The other side sent an invalid or an unexpected message."""
 
 
 class Message(NamedTuple):
-    """What came through the pipe.
+    """Message received through the pipe.
 
     Attributes:
         kind: one byte; see `bench.sealing.inside` and `bench.sealing.outside`.
-        flags: of the kind.
-        size: likewise.
-        body: bytes; valid until the next message is read.
+        flags: number whose meaning depends on the kind.
+        size: number whose meaning depends on the kind.
+        body: content; valid until the next message is read.
     """
 
     kind: bytes
@@ -67,23 +66,23 @@ class Message(NamedTuple):
     body: memoryview
 
     def numbers(self) -> Array:
-        """The body as a fresh array (n,).
+        """Return the body as a new array (n,).
 
         Raises:
-            FoulError: it is none.
+            FoulError: its size is not that of an array.
         """
         if len(self.body) % 8:
             raise FoulError("it sent half a number")
         return np.frombuffer(self.body, dtype="<f8").astype(np.float64)
 
     def document(self, limit: int = TEXT_LIMIT) -> Any:
-        """The body as JSON.
+        """Return the body as a JSON document.
 
         Args:
-            limit: bytes that it may have, since what it becomes takes much more.
+            limit: maximum size in bytes, because the parsed document takes much more memory.
 
         Raises:
-            FoulError: it is none, or longer.
+            FoulError: the body is not JSON, or longer.
         """
         if len(self.body) > limit:
             raise FoulError(f"it sent {len(self.body)} bytes of JSON, {limit} are allowed")
@@ -93,12 +92,12 @@ class Message(NamedTuple):
             raise FoulError("it sent what is no JSON") from None
 
     def text(self) -> str:
-        """The body as text that can stand in a table."""
+        """Return the body as printable text."""
         return printable(bytes(self.body[:TEXT_LIMIT]).decode("utf-8", "replace"))
 
 
 def printable(text: str) -> str:
-    """A text without what would move a terminal's cursor or end a table's row."""
+    """Replace characters that would move a terminal's cursor or end a table's row."""
     return "".join(c if c.isprintable() or c in "\n\t" else "\ufffd" for c in text)
 
 
@@ -106,8 +105,8 @@ class Channel:
     """One side of a pair of pipes.
 
     Args:
-        reading: file descriptor.
-        writing: file descriptor.
+        reading: file descriptor to read from.
+        writing: file descriptor to write to.
     """
 
     def __init__(self, reading: int, writing: int) -> None:
@@ -117,17 +116,17 @@ class Channel:
         self._incoming, self._outgoing = select.poll(), select.poll()
         self._incoming.register(reading, select.POLLIN)
         self._outgoing.register(writing, select.POLLOUT)
-        # Who does not read must not make the other side wait for ever.
+        # Non-blocking, so that a side that does not read cannot block the other one forever.
         os.set_blocking(writing, False)
 
     def close(self) -> None:
-        """Close both pipes; the other side learns of it."""
+        """Close both pipes; the other side gets an end of file."""
         for descriptor in (self._reading, self._writing):
             os.close(descriptor)
 
     @property
     def spoken_to(self) -> bool:
-        """Whether there is something to be read."""
+        """Whether there is data to read."""
         return any(event & select.POLLIN for _, event in self._incoming.poll(0))
 
     def send(
@@ -138,24 +137,30 @@ class Channel:
         size: int = 0,
         deadline: float = float("inf"),
     ) -> None:
-        """Write a message.
+        """Send a message.
 
         Args:
             kind: one byte.
-            parts: of the body; arrays are float64.
+            parts: parts of the body; arrays are float64.
             flags: 0 to 255.
             size: at least 0.
-            deadline: by `time.perf_counter`.
+            deadline: latest time, as of `time.perf_counter`.
 
         Raises:
-            GoneError: nobody reads any more.
-            TimeoutError: nobody reads in time.
+            GoneError: the other side has closed its pipe.
+            TimeoutError: the other side does not read in time.
         """
         body = b"".join([part if isinstance(part, bytes) else bytes(part) for part in parts])
         self._write(_HEAD.pack(kind, flags, size, len(body)) + body, deadline)
 
     def send_document(self, kind: bytes, document: Any, flags: int = 0) -> None:
-        """Write a message whose body is JSON."""
+        """Send a message whose body is JSON.
+
+        Args:
+            kind: one byte.
+            document: JSON content.
+            flags: 0 to 255.
+        """
         self.send(kind, json.dumps(document).encode(), flags=flags)
 
     def _write(self, whole: bytes, deadline: float) -> None:
@@ -170,16 +175,16 @@ class Channel:
                 raise GoneError from None
 
     def receive(self, limit: int = TEXT_LIMIT, deadline: float = float("inf")) -> Message:
-        """The next message.
+        """Receive the next message.
 
         Args:
-            limit: bytes that its body may have.
-            deadline: by `time.perf_counter`.
+            limit: maximum size of the body in bytes.
+            deadline: latest time, as of `time.perf_counter`.
 
         Raises:
             GoneError: the other side has ended.
-            FoulError: that is no message.
-            TimeoutError: there is none in time.
+            FoulError: the data are not a valid message.
+            TimeoutError: there is no message in time.
         """
         there = self._read(self._view, deadline)
         while there < _HEAD.size:
@@ -198,7 +203,7 @@ class Channel:
         return Message(kind, flags, size, body)
 
     def _long(self, there: int, length: int, deadline: float) -> memoryview:
-        """A body that is longer than the buffer; it takes no more memory than has been sent."""
+        """Read a body that is longer than the buffer; memory grows only with the data received."""
         body = bytearray(self._view[_HEAD.size : _HEAD.size + there])
         while len(body) < length:
             part = self._view[: min(_BUFFER, length - len(body))]
@@ -206,7 +211,7 @@ class Channel:
         return memoryview(body)
 
     def _read(self, into: memoryview, deadline: float) -> int:
-        # Waiting and reading: a read that waits could not be ended at the deadline.
+        # `poll` comes before `readv`, because a blocking read could not stop at the deadline.
         if not self._incoming.poll(_milliseconds(deadline)):
             raise TimeoutError
         try:
@@ -220,16 +225,15 @@ class Channel:
 
 def _milliseconds(deadline: float) -> float | None:
     left = (deadline - perf_counter()) * 1e3
-    # A limit of years is none, and more than poll takes.
+    # A larger timeout exceeds the range of `poll`, and is replaced by no timeout.
     return None if left > _LONGEST else max(0.0, left)
 
 
 def packed(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, ...]:
-    """Named arrays as the parts of a body: a line of JSON that says what they are, then their
-    bytes.
+    """Pack named arrays into the parts of a body: a line of JSON, then the bytes of the arrays.
 
     Raises:
-        ValueError: an array of another type than numbers have.
+        ValueError: an array has a type that is not permitted.
     """
     held = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     for name, array in held.items():
@@ -240,10 +244,10 @@ def packed(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, ...]:
 
 
 def unpacked(body: memoryview) -> dict[str, NDArray[Any]]:
-    """The arrays of a body that `packed` made.
+    """Unpack the arrays of a body that `packed` made.
 
     Raises:
-        FoulError: it is none.
+        FoulError: the body is not valid.
     """
     line, _, _ = bytes(body[:_NAMES]).partition(b"\n")
     rest = body[len(line) + 1 :]
@@ -261,10 +265,10 @@ def unpacked(body: memoryview) -> dict[str, NDArray[Any]]:
 
 
 def _name(name: object) -> str:
-    """The name of an array, which becomes one of a file's.
+    """Check the name of an array, which is used as a name in a file.
 
     Raises:
-        ValueError: it cannot.
+        ValueError: the name is not valid.
     """
     if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) < _NAME_LENGTH:
         raise ValueError
@@ -272,16 +276,25 @@ def _name(name: object) -> str:
 
 
 _NAME_LENGTH = 500
-"""Characters of an array's name."""
+"""Upper limit of the length of an array's name in characters."""
 
 
 def _array(
     data: memoryview, place: int, kind: str, shape: Sequence[int]
 ) -> tuple[NDArray[Any], int]:
-    """The array that begins at a place, and where it ends.
+    """Read the array at a position.
+
+    Args:
+        data: bytes of all arrays.
+        place: position of the array.
+        kind: type of the array.
+        shape: shape of the array.
+
+    Returns:
+        The array, and the position of its end.
 
     Raises:
-        ValueError: there is none.
+        ValueError: type or shape are not valid.
     """
     if kind not in _TYPES or not all(type(n) is int and 0 <= n < 1 << 40 for n in shape):
         raise ValueError

@@ -17,43 +17,50 @@ import numpy as np
 from methods.base import Array
 
 _ROUNDS = 15
-"""Rounds of reweighed least squares."""
+"""Number of iterations of reweighted least squares."""
 _LEAST = 8
-"""Samples that must be seen before anything is bridged."""
+"""Minimum number of available samples for filling gaps."""
 _OUTLYING = 2.0
-"""Median distances from the map beyond which Cauchy's weights take a sample for foreign."""
+"""Width of Cauchy's weight function, in median absolute residuals of the map."""
 _FINEST = 1e-6
-"""Standard deviations of the channel; agreement that is closer still is as good as exact."""
+"""Minimum width of Cauchy's weight function, in standard deviations of the channel.
+
+A closer agreement counts as exact.
+"""
 _BEFORE = 0.1
-"""Least denominator of (1); below it the map's pole is near, where the motion meets the camera."""
+"""Minimum denominator of (1).
+
+A smaller one means that the pole of the map is near, where the motion reaches the camera.
+"""
 
 
 def bridged(seen: Array, shown: Array) -> Array:
-    """Fill the gaps of a sensor's channel from a simulation, through the map from one to the other.
+    """Fill the gaps of a sensor's channel from a simulation, through the map (1) between them.
 
-    The three numbers of the map (1) are fitted to the samples that are there, as (2) and with
-    Cauchy's weights: a model that is not yet right agrees with the sensor only at times.
+    The three numbers of the map are fitted to the available samples, as (2) and with Cauchy's
+    weights, because an inaccurate model agrees with the sensor only in parts of a run.
 
     Args:
-        seen: (T,) the channel, NaN where it shows nothing.
-        shown: (T,) what the simulation shows at the same instants, with another sensor.
+        seen: (T,) channel with NaN for missing samples.
+        shown: (T,) simulated values at the same times, of another sensor.
 
     Returns:
-        (T,) the channel; with its gaps where too little is seen or no such map exists.
+        (T,) channel without gaps; unchanged if there are too few samples or no such map.
     """
     there = np.isfinite(seen)
     if there.all() or there.sum() < _LEAST:
         return seen
-    # a simulation that stands still says nothing of where the sensor would see it
+    # A simulation at rest does not determine the map.
     if not np.ptp(shown[there]) > 0:
         return seen
-    # metres and pixels differ by orders of magnitude; scaled, all columns of (2) weigh alike
+    # Metres and pixels differ by orders of magnitude; scaling gives all columns of (2) equal
+    # weight.
     x = _scaled(shown, shown[there])
     y = _scaled(seen, seen[there])
     table = np.stack([np.ones_like(x), x, -x * y], axis=1)[there]
     a, b, c = _fitted(table, y[there])
     below = 1 + c * x
-    # a sign that changes within the run would put a part of it on the other side of the camera
+    # A change of sign would put a part of the run behind the camera.
     if not (below > _BEFORE).all():
         return seen
     mapped = (a + b * x) / below  # (1)
@@ -63,7 +70,7 @@ def bridged(seen: Array, shown: Array) -> Array:
 
 
 def _fitted(table: Array, values: Array) -> Array:
-    """The numbers (3,) of (2), by least squares with Cauchy's weights."""
+    """Compute the numbers (3,) of (2) by iteratively reweighted least squares, Cauchy's weights."""
     weights: Array = np.ones(len(table))
     numbers: Array = np.zeros(3)
     for _ in range(_ROUNDS):
@@ -71,13 +78,13 @@ def _fitted(table: Array, values: Array) -> Array:
         numbers = solution.astype(np.float64)
         rest: Array = values - table @ numbers
         width = max(_OUTLYING * float(np.median(np.abs(rest))), _FINEST)
-        # the root of Cauchy's weight, since it multiplies both sides of (2)
+        # This is the root of Cauchy's weight, because it multiplies both sides of (2).
         weights = 1 / np.sqrt(1 + (rest / width) ** 2)
     return numbers
 
 
 def _scaled(values: Array, some: Array) -> Array:
-    """Values in standard deviations from the mean, both of `some` of them."""
+    """Return values in standard deviations from the mean, both computed from `some` of them."""
     spread = float(some.std())
     divisor = spread if spread > 0 else 1.0
     result: Array = (values - float(some.mean())) / divisor

@@ -19,20 +19,20 @@ from methods.base import Array, Scene
 from methods.learning.responses import responses
 
 _ROUNDING = 1e-9
-"""Numbers that differ by less than this share of their size are alike."""
+"""Relative difference below which numbers count as equal."""
 _NORMAL = 1.4826
-"""Standard deviations of a normal distribution in one median distance from its median."""
+"""Standard deviations of a normal distribution per median absolute deviation."""
 
 
 @dataclass(frozen=True)
 class Circumstances:
-    """A map from scenes and observations to network inputs.
+    """Map from scenarios and observations to network inputs that describe the scenario.
 
     Attributes:
-        centre: (K,) medians in training: of the initial values, then of the responses' coefficients
-            where inputs vary.
-        spread: (K,) median distances from them; 0 where a number says nothing.
-        initial: how many of the K are initial values.
+        centre: (K,) medians of the training data: first the initial values, then the response
+            coefficients if inputs vary.
+        spread: (K,) scaled median absolute deviations from them; 0 for a constant number.
+        initial: number of initial values among the K numbers.
     """
 
     centre: Array
@@ -43,20 +43,24 @@ class Circumstances:
     def learned(
         cls, scenes: Sequence[Scene], observations: Array, lengths: tuple[int, ...]
     ) -> Circumstances | None:
-        """The map for training scenarios, or None where they are alike.
+        """Compute the map from training scenarios.
 
         Args:
-            scenes: of each scenario.
-            observations: (scenarios, each, T, C).
-            lengths: samples of each run.
+            scenes: scenario information of each scenario.
+            observations: (scenarios, m, T, C) observations of m simulations per scenario.
+            lengths: number of samples of each run.
+
+        Returns:
+            The map; None if all scenarios are equal.
         """
         initial = np.array([scene.initial for scene in scenes])
         driven = _vary(np.array([scene.inputs for scene in scenes]))
-        # where scenarios are alike nothing is to be told, and every input would be a constant
+        # Equal scenarios give constant inputs, which carry no information.
         if not driven and not _vary(initial):
             return None
         count = initial.shape[1]
-        # stands for the map to be: one number beyond the initial values says that it is driven
+        # A preliminary map for the raw numbers: one number beyond the initial values marks varying
+        # inputs.
         unscaled = cls(np.empty(count + driven), np.empty(0), count)
         table = np.concatenate(
             [
@@ -64,18 +68,27 @@ class Circumstances:
                 for observation, scene in zip(observations, scenes, strict=True)
             ]
         )
-        # medians: a fitted coefficient is far off where a run hardly moves
+        # Medians are used, because a fitted coefficient can be far off if a run hardly moves.
         centre = np.median(table, axis=0)
         distances = np.abs(table - centre)
         return cls(centre, _NORMAL * np.median(distances, axis=0), count)
 
     @property
     def driven(self) -> bool:
-        """Whether inputs vary, so that responses are read."""
+        """Whether inputs vary between scenarios, so that response coefficients are computed."""
         return self.initial < len(self.centre)
 
     def numbers(self, observations: Array, lengths: tuple[int, ...], scene: Scene) -> Array:
-        """What is read (n, K) of observations (n, T, C) in one scene, SI units and samples."""
+        """Compute the unscaled numbers of observations in one scenario.
+
+        Args:
+            observations: (n, T, C) observations in SI units.
+            lengths: number of samples of each run.
+            scene: scenario information.
+
+        Returns:
+            (n, K) numbers.
+        """
         shape = len(observations), len(scene.initial)
         initial = np.broadcast_to(scene.initial, shape)
         if not self.driven:
@@ -84,11 +97,18 @@ class Circumstances:
         return np.concatenate([initial, coefficients], axis=1)
 
     def __call__(self, observations: Array, lengths: tuple[int, ...], scene: Scene) -> Array:
-        """Network inputs (n, K) of observations (n, T, C); far from what training saw they grow as
-        a logarithm.
+        """Compute network inputs, which grow logarithmically far from the training data.
+
+        Args:
+            observations: (n, T, C) observations in SI units.
+            lengths: number of samples of each run.
+            scene: scenario information.
+
+        Returns:
+            (n, K) network inputs.
 
         Raises:
-            ValueError: a scene of another kind than the network was trained in.
+            ValueError: the scenario has another number of values than those of the training.
         """
         numbers = self.numbers(observations, lengths, scene)
         if len(scene.initial) != self.initial or numbers.shape[1] != len(self.centre):
@@ -98,14 +118,15 @@ class Circumstances:
                 "train on scenarios with the same inputs and channels"
             )
         says = self.spread > 0
-        # a number that never varied in training gets no weight, whatever it is now
+        # A number that was constant in training gets no weight.
         scale = np.where(says, 1.0 / np.where(says, self.spread, 1.0), 0.0)
-        # arcsinh is the identity near zero and a logarithm far out: outliers do not saturate units
+        # arcsinh is the identity near zero and logarithmic far out, so outliers do not saturate
+        # units.
         return np.asarray(np.arcsinh((numbers - self.centre) * scale), dtype=np.float64)
 
 
 def _vary(numbers: Array) -> bool:
-    """Whether any number (scenarios, ...) differs between scenarios."""
+    """Return whether any number of an array (scenarios, ...) differs between scenarios."""
     if not numbers.size:
         return False
     sizes = np.abs(numbers).max(axis=0)

@@ -24,13 +24,14 @@ from methods.base import Array
 
 @dataclass(frozen=True)
 class Settings:
-    """Kernel and priors (log-normal) of the hyper-parameters.
+    """Kernel and log-normal priors of the hyper-parameters.
 
     Attributes:
         kernel: squared exponential (4.9) or Matérn 5/2 (4.17).
-        length: a length scale's median, a share of the cube, and its standard deviation in units of
-            the logarithm.
-        noise: the same for the noise variance, as a share of the process's variance.
+        length: median of a length scale, as a share of the cube, and its standard deviation on the
+            logarithmic scale.
+        noise: median of the noise variance, as a share of the process's variance, and its standard
+            deviation on the logarithmic scale.
     """
 
     kernel: Literal["rbf", "matern"] = "matern"
@@ -39,13 +40,14 @@ class Settings:
 
 
 class GaussianProcess:
-    """The posterior given n simulations; mean and variance are profiled out, length scales and
-    noise are fitted.
+    """Gaussian-process posterior given n simulations.
+
+    Mean and variance are profiled out; length scales and noise are fitted.
 
     Attributes:
         hyper: (dim + 1,) logarithms of the length scales and of the noise.
         mean: constant mean.
-        variance: the process's variance.
+        variance: variance of the process.
     """
 
     def __init__(
@@ -56,8 +58,14 @@ class GaussianProcess:
         hyper: Array | None = None,
         fit: bool = True,
     ) -> None:
-        """Condition on `values` (n,) at `points` (n, dim); start the fit from `hyper`, or take it
-        as it is.
+        """Condition the process on simulated values.
+
+        Args:
+            points: (n, dim) points of the unit cube.
+            values: (n,) values at the points.
+            settings: kernel and priors.
+            hyper: (dim + 1,) initial hyper-parameters; None for the prior medians.
+            fit: True to fit the hyper-parameters, False to use the initial ones.
         """
         self.points = points
         self.values = values
@@ -71,7 +79,7 @@ class GaussianProcess:
         self._centre = np.log(np.append(lengths, noise))
         self._width = np.append(widths, noise_width)
         self.hyper = self._centre if hyper is None else hyper
-        # two points, or values all alike, say nothing of a length
+        # Two points, or equal values, give no information about a length scale.
         if fit and len(points) > 2 and np.ptp(values) > 0.0:
             self.hyper = self._most_probable()
         k, _ = self._correlation(self._squares)
@@ -79,8 +87,14 @@ class GaussianProcess:
         self.mean, self.variance, self._alpha = _profile(self._lower, values)
 
     def _correlation(self, squares: Array, hyper: Array | None = None) -> tuple[Array, Array]:
-        """Correlation of pairs with squared differences (n, m, dim), and its derivative by their
-        scaled sum.
+        """Compute the correlation of pairs, and its derivative by their scaled squared distance.
+
+        Args:
+            squares: (n, m, dim) squared differences of the pairs.
+            hyper: (dim + 1,) hyper-parameters; None for the present ones.
+
+        Returns:
+            Correlations (n, m) and derivatives (n, m).
         """
         chosen = self.hyper if hyper is None else hyper
         lengths = chosen[:-1]
@@ -92,16 +106,16 @@ class GaussianProcess:
         decay = np.exp(-root)
         polynomial = 1.0 + root + root**2 / 3.0
         k = polynomial * decay  # (4.17)
-        # by the scaled sum and not by the distance, whose derivative at zero would divide by it
+        # The derivative by the squared distance avoids a division by zero at zero distance.
         return k, -5.0 / 6.0 * (1.0 + root) * decay
 
     def _most_probable(self) -> Array:
-        """Maximum of likelihood times prior, by L-BFGS."""
+        """Maximise likelihood times prior by L-BFGS."""
         from scipy.optimize import minimize
 
         def objective(hyper: Array) -> tuple[float, Array]:
             value, slope = self._evidence(hyper)
-            # the priors, normal in the logarithms
+            # The priors are normal distributions of the logarithms.
             z = (hyper - self._centre) / self._width
             return value + 0.5 * float(z @ z), slope + z / self._width
 
@@ -119,35 +133,42 @@ class GaussianProcess:
         return np.asarray(optimum.x)
 
     def _evidence(self, hyper: Array) -> tuple[float, Array]:
-        """Negative logarithm of the marginal likelihood (2.30), and its gradient (5.9)."""
+        """Compute the negative log marginal likelihood (2.30) and its gradient (5.9)."""
         from scipy.linalg import cho_solve
 
         n = len(self.values)
         k, slope = self._correlation(self._squares, hyper)
         lower = _cholesky(k, float(np.exp(hyper[-1])))
         _, variance, alpha = _profile(lower, self.values)
-        # (2.30) with the best variance: its quadratic term is then n / 2, a constant
+        # (2.30) with the profiled variance: its quadratic term is the constant n / 2.
         half_determinant = np.log(np.diag(lower)).sum()
         value = 0.5 * n * np.log(variance) + half_determinant
         inverse = cho_solve((lower, True), np.eye(n))
         outer = np.outer(alpha, alpha)
         weight = 0.5 * (inverse - outer / variance)  # (5.9)
         by_squares = np.einsum("ij,ijd->d", weight * slope, self._squares)
-        # the chain rule: squares are divided by squared lengths, whose logarithms are the variables
+        # Chain rule: squares are divided by squared lengths, whose logarithms are the variables.
         by_length = by_squares * -2.0 * np.exp(-2.0 * hyper[:-1])
         by_noise = np.trace(weight) * np.exp(hyper[-1])
         return float(value), np.append(by_length, by_noise)
 
     def predict(self, points: Array) -> Array:
-        """Posterior mean (2.25) at (m, dim)."""
+        """Compute the posterior mean (2.25) at points (m, dim)."""
         squares = (points[:, None] - self.points) ** 2
         k, _ = self._correlation(squares)
         mean: Array = self.mean + k @ self._alpha  # (2.25)
         return mean
 
     def sample(self, points: Array, draws: int, rng: np.random.Generator) -> Array:
-        """Joint posterior draws (draws, m) at (m, dim), by a Cholesky factor of their covariance
-        (2.26).
+        """Draw joint samples of the posterior by a Cholesky factor of its covariance (2.26).
+
+        Args:
+            points: (m, dim) points of the unit cube.
+            draws: number of samples.
+            rng: random generator.
+
+        Returns:
+            (draws, m) samples.
         """
         from scipy.linalg import solve_triangular
 
@@ -164,18 +185,18 @@ class GaussianProcess:
 
 
 def _cholesky(matrix: Array, jitter: float) -> Array:
-    """Lower factor of matrix + jitter, with as much more jitter as it takes."""
+    """Return the lower Cholesky factor of matrix + jitter, with more jitter if it is needed."""
     while True:
         shifted = matrix + jitter * np.eye(len(matrix))
         try:
             return np.asarray(np.linalg.cholesky(shifted), dtype=np.float64)
         except np.linalg.LinAlgError:
-            # points that nearly coincide leave rounding below zero
+            # Points that nearly coincide give eigenvalues below zero by rounding.
             jitter = max(10.0 * jitter, 1e-12)
 
 
 def _profile(lower: Array, values: Array) -> tuple[float, float, Array]:
-    """The most likely constant mean and variance, and K⁻¹(values - mean)."""
+    """Return the maximum-likelihood constant mean and variance, and K⁻¹(values - mean)."""
     from scipy.linalg import cho_solve
 
     weights = cho_solve((lower, True), np.ones(len(values)))
@@ -183,5 +204,5 @@ def _profile(lower: Array, values: Array) -> tuple[float, float, Array]:
     rest = values - mean
     alpha = cho_solve((lower, True), rest)
     variance = float(rest @ alpha) / len(values)
-    # values all alike have none, and its logarithm is taken
+    # Equal values have variance zero, whose logarithm would be infinite.
     return mean, max(variance, 1e-20), alpha

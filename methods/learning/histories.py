@@ -1,4 +1,4 @@
-"""Simulated tuning histories: what a network that sees a whole history is trained on.
+"""Simulated tuning histories as training data of networks that read a whole history.
 
 Source: X. Zhang, S. Liu et al., Dynamics as Prompts, IEEE RA-L 2025, arXiv 2410.20357, Algorithm 1.
 From a source to a target, the next point lies between the nearest points tried on either side:
@@ -17,11 +17,20 @@ from numpy.typing import NDArray
 from methods.base import Array, Practice
 
 _CENTRED = 2.0
-"""a of (2), which the paper leaves open; 1 would be uniform."""
+"""Parameter a of (2), which the paper does not state; 1 would be a uniform distribution."""
 
 
 def binary_search(simulator: Practice, rng: np.random.Generator, count: int) -> Array:
-    """Points (count, dim) of the training range: a target, and a binary search for it by chance."""
+    """Draw a target and a random binary search for it, in the training range.
+
+    Args:
+        simulator: training simulator.
+        rng: random generator.
+        count: number of points, including the target.
+
+    Returns:
+        (count, dim) points; the first one is the target.
+    """
     target, source = simulator.sample(rng, 2)
     lower, upper = (corner.copy() for corner in simulator.training)
     points = [target, source]
@@ -36,11 +45,11 @@ def binary_search(simulator: Practice, rng: np.random.Generator, count: int) -> 
 
 
 class Histories(NamedTuple):
-    """Which simulations of a scenario make a history, by number.
+    """Indices of the simulations of a scenario that form histories.
 
     Attributes:
-        targets: (n,) whose parameters are sought.
-        tried: (n, window) simulations in the order in which they are looked at.
+        targets: (n,) indices of the targets.
+        tried: (n, window) indices of the tried simulations, in their order.
     """
 
     targets: NDArray[np.intp]
@@ -48,7 +57,13 @@ class Histories(NamedTuple):
 
 
 def shuffled(rng: np.random.Generator, count: int, window: int) -> Histories:
-    """Each of `count` simulations as the target once, and others in any order."""
+    """Make one history for each simulation as target, with other simulations in random order.
+
+    Args:
+        rng: random generator.
+        count: number of simulations.
+        window: length of a history.
+    """
     tried = np.empty((count, window), dtype=np.intp)
     for target in range(count):
         others = rng.permutation(np.delete(np.arange(count), target))
@@ -57,6 +72,11 @@ def shuffled(rng: np.random.Generator, count: int, window: int) -> Histories:
 
 
 def in_order(count: int, window: int) -> Histories:
-    """Every run of `window` simulations of the search for the first one, as published."""
+    """Make histories of `window` successive simulations for the first one as target, as published.
+
+    Args:
+        count: number of simulations.
+        window: length of a history.
+    """
     starts = np.arange(1, count - window + 1)
     return Histories(np.zeros(len(starts), dtype=np.intp), starts[:, None] + np.arange(window))

@@ -1,4 +1,4 @@
-"""The trained object that TuneNet and its regressor share."""
+"""Base class of tuners on TuneNet's pair network: training, state and estimates."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from methods.learning.reader import Reader, Reading
 from methods.learning.rehearsal import Rehearsal, rehearse
 
 _OWN = "own-"
-"""Begins the names of the arrays of a proposed side that reads something of its own."""
+"""Prefix of array names of the proposed side if both sides have different inputs."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """Looks on while one network is trained.
+    """Monitor of the training of one network.
 
     Attributes:
-        held_out: simulations that measure only.
-        epoch: told of each pass: its number from 1, how many there are, training and held-out loss.
+        held_out: simulations that are used for evaluation only.
+        epoch: called after each epoch with its number from 1, the number of epochs, training loss
+            and held-out loss.
     """
 
     held_out: Rehearsal
@@ -35,13 +36,14 @@ class Look:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A trained network together with what it reads.
+    """A trained pair network with its input features.
 
     Attributes:
-        design: how the network is built.
-        read: observations and scenes to input rows, on the target's side.
-        weights: the network's arrays by name.
-        proposed: the same on the proposed side; the same object where both sides read the same.
+        design: design of the network.
+        read: map from observations and scenarios to input rows of the target's side.
+        weights: weight arrays by name.
+        proposed: map to input rows of the proposed side; the object `read` if both sides have the
+            same inputs.
     """
 
     design: Design
@@ -59,7 +61,16 @@ class Fitted:
         alone: bool,
         look: Look | None,
     ) -> Fitted:
-        """Choose the inputs and train the network on them; `alone` as in `pair_network.train`."""
+        """Choose the inputs, and train the network on them.
+
+        Args:
+            design: design of the network.
+            data: training data.
+            rng: random generator.
+            reading: configuration of the inputs.
+            alone: as in `pair_network.train`.
+            look: monitor of the training; None for none.
+        """
         read = Reader.learned(data, reading)
         proposed = Reader.learned(data.pure, reading.proposed) if reading.proposed else read
         watched = None
@@ -72,19 +83,26 @@ class Fitted:
         return cls(design, read, weights, proposed)
 
     def difference(self, proposed: Array, target: Array) -> Array:
-        """h(proposed, target) of input rows; see `pair_network.estimate`."""
+        """Compute h(proposed, target) of input rows; see `pair_network.estimate`.
+
+        Args:
+            proposed: (n, D) or (D,) input rows of the proposed side.
+            target: (n, E) or (E,) input rows of the target's side.
+        """
         return estimate(self.weights, self.design, proposed, target)
 
     def estimator(self, task: Task) -> Callable[[Array], Array]:
-        """From one simulation (1, T, C) to h(simulation, target), (dim,); NaN where the simulation
-        failed.
+        """Return the function from one simulation (1, T, C) to h(simulation, target), shape (dim,).
+
+        The result is NaN if the simulation failed.
         """
         alike = self.proposed is self.read
-        # hidden in the simulation too, so that the truth gives the target's own row
+        # Samples missing in the target are hidden in the simulation too, so that the true
+        # parameters give the target's own row.
         hidden = np.isnan(task.observed) if alike else None
         row = None
         if alike:
-            # the target's row is the same for every simulation, unless gaps are bridged by it
+            # The target's row is equal for all simulations, unless a simulation fills its gaps.
             row = self.read(task.observed[None], task.lengths, task.scene, hidden)[0]
 
         def difference(observations: Array) -> Array:
@@ -100,20 +118,25 @@ class Fitted:
         return difference
 
     def state(self) -> dict[str, Array]:
-        """Everything as plain arrays."""
+        """Return weights and input features as plain arrays by name."""
         state = self.read.state() | self.weights
         if self.proposed is self.read:
             return state
-        # both sides' arrays have the same names
+        # The arrays of both sides have the same names.
         own = {_OWN + name: array for name, array in self.proposed.state().items()}
         return own | state
 
     @classmethod
     def restored(cls, state: dict[str, Array], design: Design, reading: Reading) -> Fitted:
-        """The inverse of `state`.
+        """Restore a network from the arrays of `state`.
+
+        Args:
+            state: arrays by name.
+            design: design of the network.
+            reading: configuration of the inputs.
 
         Raises:
-            ValueError: arrays of other names or shapes, or numbers that are not finite.
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
         """
         own: dict[str, Array] = {}
         common: dict[str, Array] = {}
@@ -128,59 +151,66 @@ class Fitted:
 
 
 def _sides(proposed: Reader, target: Reader, data: Rehearsal) -> Sides:
-    """Input rows of both sides; a side of its own sees simulations, which no sensor spoils."""
+    """Compute input rows of both sides; separate inputs of the proposed side have no noise."""
     rows = target.table(data)
     own = rows if proposed is target else proposed.table(data.pure)
     return Sides(own, rows)
 
 
 def _bridged(task: Task, shown: Array, network: Fitted) -> Array:
-    """The target (T, C) with its gaps bridged by a simulation (T, C), run by run, where one channel
-    is compared.
+    """Fill the gaps of the target (T, C) from a simulation (T, C), run by run.
+
+    This is done only if one channel is compared.
     """
     sensor = network.proposed.reading.part(shown)
     whole = task.observed.copy()
-    # a map from one number to one: from several channels nobody knows which shows what
+    # With several channels of the simulation, the one that belongs to the sensor is not known.
     if sensor.shape[-1] != 1:
         return whole
     ends = np.cumsum(task.lengths)
     for first, end in zip(ends - task.lengths, ends, strict=True):
-        # columns of the copy, so that they are filled in place
+        # Slices of the copy are filled in place.
         for channel in network.read.reading.part(whole[first:end]).T:
             channel[:] = bridged(channel, sensor[first:end, 0])
     return whole
 
 
 class PairTuner(Tuner):
-    """What the tuners on TuneNet's network share; subclasses say how it is built and what it reads,
-    and tune.
+    """Base class of tuners on TuneNet's network.
+
+    Subclasses define the design, the inputs and the tuning loop.
     """
 
     requires: ClassVar[tuple[str, ...]] = ("torch",)
     stochastic: ClassVar[bool] = False
     learned: ClassVar[bool] = True
     alone: ClassVar[bool] = False
-    """As in `pair_network.train`."""
+    """Whether the network has a single input, the target; see `pair_network.train`."""
 
     _fitted: Prepared[Fitted] | None = None
 
     def design(self) -> Design:
-        """How the network is built and trained."""
+        """Return the design of the network."""
         raise NotImplementedError
 
     def reading(self) -> Reading:
-        """What it reads."""
+        """Return the configuration of the inputs."""
         raise NotImplementedError
 
     def layout(self, dim: int) -> tuple[int, int]:
-        """Training scenarios, at most as many as the budget allows, and simulations in each."""
+        """Return the maximum number of training scenarios, and of simulations in each."""
         raise NotImplementedError
 
     def fit(self, simulator: Practice, rng: np.random.Generator, budget: int) -> None:
         """Train on at most `budget` simulations of the training range.
 
+        Args:
+            simulator: training simulator.
+            rng: random generator.
+            budget: maximum number of simulations.
+
         Raises:
-            ValueError: a budget of less than two scenarios.
+            ValueError: the budget is smaller than two scenarios.
         """
         scenarios, each = self.layout(simulator.dim)
         data = rehearse(simulator, rng, budget, scenarios, each)
@@ -188,7 +218,7 @@ class PairTuner(Tuner):
         apart = None
         if watch is not None:
             ground = watch.ground
-            # simulations of their own, from a stream of their own: training does not notice
+            # Separate simulations and a separate random stream do not affect the training.
             stream = np.random.default_rng(0)
             apart = rehearse(ground, stream, ground.budget, scenarios, max(each, 2))
         self.learn(data, rng, apart)
@@ -196,7 +226,13 @@ class PairTuner(Tuner):
     def learn(
         self, data: Rehearsal, rng: np.random.Generator, apart: Rehearsal | None = None
     ) -> None:
-        """Train on simulations; `apart` are others, on which `watch` sees how well."""
+        """Train on simulations.
+
+        Args:
+            data: training data.
+            rng: random generator.
+            apart: held-out data for the losses that `watch` gets; None for none.
+        """
         watch = self.watch
 
         def fitted(stage: str, shown: Rehearsal, noise: Array | None) -> Fitted:
@@ -208,14 +244,14 @@ class PairTuner(Tuner):
         self._fitted = Prepared.train(data, rng, self.reading(), fitted)
 
     def state(self) -> dict[str, Array]:
-        """The network's weights and what it reads, by name; empty before `fit`."""
+        """Return weights and input features by name; empty before `fit`."""
         return {} if self._fitted is None else self._fitted.state()
 
     def restore(self, state: dict[str, Array]) -> None:
-        """Take back what `state` gave.
+        """Restore the arrays that `state` returned.
 
         Raises:
-            ValueError: arrays of other names or shapes.
+            ValueError: arrays have other names or shapes.
         """
         design, reading = self.design(), self.reading()
         self._fitted = Prepared.restored(
@@ -223,10 +259,10 @@ class PairTuner(Tuner):
         )
 
     def fitted(self) -> Prepared[Fitted]:
-        """What was trained.
+        """Return the trained networks.
 
         Raises:
-            RuntimeError: nothing was.
+            RuntimeError: the tuner has not been trained.
         """
         if self._fitted is None:
             raise RuntimeError(f"{self.name} has not been trained; call fit or restore first")

@@ -25,33 +25,35 @@ from methods.base import Array
 from methods.learning.rehearsal import Rehearsal
 
 _PARTS = 8
-"""Parts of a run in which its roughness is looked at."""
+"""Maximum number of parts of a run for the noise estimate."""
 _LEAST_PART = 16
-"""Third differences in such a part, at least."""
+"""Minimum number of third differences in a part."""
 _NORMAL = 0.6745
-"""Median of the size of a normal variable, in its standard deviations."""
+"""Median absolute value of a normal variable, in standard deviations."""
 _THIRD: float = 20.0**0.5
-"""Third differences of white noise vary so many times as much: 1 + 9 + 9 + 1 is 20."""
+"""Standard deviation of third differences of white noise with variance 1.
+
+The variance is 1 + 9 + 9 + 1 = 20.
+"""
 _EXACT = 1e-9
-"""Of the largest deviation: what is left over below it is rounding."""
+"""Threshold of rounding errors, as a share of the largest deviation."""
 _LEAST_DEVIATION = 1e-3
-"""Of the largest deviation: a number that varies less is not scaled up further."""
+"""Minimum deviation, as a share of the largest one; smaller ones are not scaled up further."""
 _ZERO = 1e-300
-"""Keeps a quotient of nothing and nothing finite."""
+"""Minimum divisor, so that zero divided by zero is finite."""
 
 
 def resample(observations: Array, lengths: tuple[int, ...], points: int) -> Array:
-    """Bring every run to the same number of points, by linear interpolation; missing samples are
-    bridged.
+    """Resample every run to the same number of points by linear interpolation, without gaps.
 
     Args:
-        observations: (n, T, C), the runs following one another along T; NaN where a sample is
-            missing.
-        lengths: samples of each run; they add up to T.
-        points: number of points of each run afterwards, spread evenly over its samples.
+        observations: (n, T, C) observations with the runs concatenated along T; NaN for missing
+            samples.
+        lengths: number of samples of each run; their sum is T.
+        points: number of points of each resampled run, evenly spaced over its samples.
 
     Returns:
-        (n, runs * C, points); NaN throughout a series of which no sample is there.
+        (n, runs * C, points); NaN in a series without any sample.
 
     Raises:
         ValueError: the lengths do not add up to T.
@@ -66,7 +68,7 @@ def resample(observations: Array, lengths: tuple[int, ...], points: int) -> Arra
     for run, length in enumerate(lengths):
         series = observations[:, first : first + length].transpose(0, 2, 1)
         first += length
-        # interpolation at the samples themselves would give them back; most runs need none
+        # Interpolation at the samples would return them; most runs need no interpolation.
         if length == points and not np.isnan(series).any():
             out[:, run] = series
             continue
@@ -79,7 +81,7 @@ def resample(observations: Array, lengths: tuple[int, ...], points: int) -> Arra
 
 
 def _interpolated(at: Array, samples: NDArray[np.intp], values: Array) -> Array:
-    """Values (points,) between those samples that are there; NaN where none is."""
+    """Interpolate linearly between available samples, shape (points,); NaN if there are none."""
     there = ~np.isnan(values)
     if not there.any():
         return np.full(len(at), np.nan)
@@ -88,11 +90,9 @@ def _interpolated(at: Array, samples: NDArray[np.intp], values: Array) -> Array:
 
 
 def described(series: Array) -> Array:
-    """Describe each series by values and rates of change, both in the order of time and sorted by
-    size.
+    """Describe each series by values and rates of change, in order of time and sorted by size.
 
-    Sorted, a series says how large and how fast, whatever the moment: a statement that shifts in
-    time leave alone.
+    Sorted values are independent of time, so they do not change if the motion is shifted in time.
 
     Args:
         series: (n, series, points).
@@ -111,23 +111,23 @@ def described(series: Array) -> Array:
 
 
 def roughness(observations: Array, lengths: tuple[int, ...]) -> Array:
-    """Standard deviation of white noise that would explain the median third difference of a run's
-    calmest part.
+    """Estimate the standard deviation of white noise from the third differences of each run.
 
-    Smooth motion has hardly any. A run is looked at in up to eight parts, of sixteen differences at
-    least, so that impacts and rattling elsewhere do not count.
+    It is the one that explains the median third difference of the run's smoothest part, because
+    smooth motion has nearly none. A run is divided into up to eight parts of at least sixteen
+    differences, so that impacts and rattling elsewhere do not count.
 
     Args:
-        observations: (n, T, C); NaN where a sample is missing.
-        lengths: samples of each run.
+        observations: (n, T, C) observations; NaN for missing samples.
+        lengths: number of samples of each run.
 
     Returns:
-        (n, C), SI units; of each channel the roughest run, 0 where no run has four samples in a
-        row.
+        (n, C) noise in SI units: for each channel the largest one of all runs, 0 if no run has four
+        successive samples.
     """
     out = np.zeros((observations.shape[0], observations.shape[2]))
     for run in np.split(observations, np.cumsum(lengths)[:-1], axis=1):
-        # a parabola has no third differences, so smooth motion leaves next to nothing
+        # Third differences of a parabola are zero, so those of smooth motion are small.
         thirds = np.abs(np.diff(run, n=3, axis=1))
         count = min(_PARTS, max(1, thirds.shape[1] // _LEAST_PART))
         parts = np.array_split(thirds, count, axis=1)
@@ -139,7 +139,7 @@ def roughness(observations: Array, lengths: tuple[int, ...]) -> Array:
 
 
 def _calmest(parts: list[Array]) -> float:
-    """The smallest of the parts' medians, without NaN; 0 where nothing is there."""
+    """Return the smallest median of the parts, without NaN; 0 if there are no values."""
     medians = []
     for part in parts:
         there = part[~np.isnan(part)]
@@ -150,14 +150,14 @@ def _calmest(parts: list[Array]) -> float:
 
 @dataclass(frozen=True)
 class Inputs:
-    """The map from observations to a network's input rows.
+    """Map from observations to a network's input rows.
 
     Attributes:
-        points: points to which each run is resampled.
-        plain: the resampled series as they are, without rates and sorting.
-        chosen: (D,) which numbers are used.
-        centre: (D,) what is subtracted from them.
-        gain: (D,) what they are then multiplied by.
+        points: number of points to which each run is resampled.
+        plain: True to use the resampled series only, without rates and sorting.
+        chosen: (D,) indices of the numbers that are used.
+        centre: (D,) values that are subtracted from them.
+        gain: (D,) factors that they are then multiplied by.
     """
 
     points: int
@@ -167,11 +167,11 @@ class Inputs:
     gain: Array
 
     def __call__(self, observations: Array, lengths: tuple[int, ...]) -> Array:
-        """Input rows (n, D) of observations (n, T, C).
+        """Compute input rows (n, D) from observations (n, T, C).
 
         Args:
-            observations: SI units; NaN where a sample is missing.
-            lengths: samples of each run.
+            observations: observations in SI units; NaN for missing samples.
+            lengths: number of samples of each run.
 
         Raises:
             ValueError: the observation yields fewer numbers than the network was trained on.
@@ -188,38 +188,44 @@ class Inputs:
             )
         centred = rows[:, chosen] - self.centre
         scaled = centred * self.gain
-        # a series that is not there at all says nothing: its mean
+        # A series without any sample is replaced by its mean.
         return np.nan_to_num(scaled)
 
 
 def _rows(observations: Array, lengths: tuple[int, ...], points: int, plain: bool) -> Array:
-    """All numbers (n, D) that observations (n, T, C) offer."""
+    """Compute all candidate numbers (n, D) of observations (n, T, C)."""
     series = resample(observations, lengths, points)
     return series.reshape(len(series), -1) if plain else described(series)
 
 
 def raw_inputs(observations: Array, lengths: tuple[int, ...], points: int) -> Inputs:
-    """The published inputs: resampled series in SI units, neither centred nor scaled."""
+    """Make the published inputs: resampled series in SI units, neither centred nor scaled.
+
+    Args:
+        observations: (n, T, C) observations in SI units.
+        lengths: number of samples of each run.
+        points: number of points to which each run is resampled.
+    """
     size = _rows(observations[:1], lengths, points, plain=True).shape[1]
     every = np.arange(size, dtype=np.float64)
     return Inputs(points, True, every, np.zeros(size), np.ones(size))
 
 
 def weighed_inputs(data: Rehearsal, points: int, most: int, strictness: float) -> Inputs:
-    """Choose and scale inputs by how faithfully they follow the parameters.
+    """Choose and scale inputs by how closely they follow the parameters.
 
     Within each scenario every candidate number is fitted as a linear function of the parameters
-    (1). What the fit leaves over (jumps, curvature, noise) makes a number a poor guide, above all
-    outside the training range, where it jumps and bends on: that is weighed by (2) and (3). Each
-    parameter's weights are scaled to the same maximum, so that one that is seen easily does not
-    hide the others. A number that no parameter touches but that differs between scenarios tells the
-    circumstances; it weighs (4).
+    (1). A large residual of the fit (jumps, curvature, noise) means that the number is a poor
+    predictor, above all outside the training range; (2) and (3) give it a small weight. Each
+    parameter's weights are scaled to the same maximum, so that a parameter with strong effects does
+    not hide the others. A number that does not depend on the parameters but differs between
+    scenarios describes the scenario; its weight is (4).
 
     Args:
-        data: the training simulations.
-        points: points to which each run is resampled.
-        most: number of inputs to keep, those of the largest weight; 0 for none.
-        strictness: how heavily what is left over counts.
+        data: training simulations.
+        points: number of points to which each run is resampled.
+        most: maximum number of inputs, those with the largest weights; 0 for none.
+        strictness: factor s of the residual in (2) and (4).
 
     Returns:
         The inputs; their mean square over the training data is 1.
@@ -235,13 +241,13 @@ def weighed_inputs(data: Rehearsal, points: int, most: int, strictness: float) -
     share = faith / np.where(best > 0, best, 1.0)
     following = np.max(share**2, axis=0)  # (3)
     context = (between / (between + strictness * spread + floor)) ** 2  # (4)
-    # a stable order, so that equal weights choose the same numbers everywhere
+    # A stable sort chooses the same numbers on every machine if weights are equal.
     order = np.argsort(-np.maximum(following, context), kind="stable")
     chosen = np.sort(order[:most])
     by_parameters = _per(following[chosen], spread[chosen])
     by_context = _per(context[chosen], deviation[chosen])
     gain = np.maximum(by_parameters, by_context)
-    # the network's initial weights and rate are made for inputs of mean square 1
+    # The network's initial weights and learning rate assume inputs of mean square 1.
     size = np.sqrt(np.mean((gain * deviation[chosen]) ** 2)) if most else 1.0
     return Inputs(
         points,
@@ -253,20 +259,23 @@ def weighed_inputs(data: Rehearsal, points: int, most: int, strictness: float) -
 
 
 def _per(weight: Array, deviation: Array) -> Array:
-    """Weight per unit of deviation, bounded where there is hardly any."""
+    """Return the weight per unit of deviation, limited for small deviations."""
     least = _LEAST_DEVIATION * deviation.max(initial=0.0)
     scaled: Array = weight / (deviation + least + _ZERO)
     return scaled
 
 
 def _followed(parameters: Array, rows: Array) -> tuple[Array, Array, Array]:
-    """Root mean squares within scenarios of each number (D,), what each parameter explains (dim,
-    D), the rest (D,).
+    """Fit each number as a linear function of the parameters within scenarios.
+
+    Returns:
+        Root mean squares of each number (D,), of the part that each parameter explains (dim, D),
+        and of the residual (D,).
     """
     scenarios, each, dim = parameters.shape
     count = rows.shape[2]
     offsets = parameters - parameters.mean(axis=1, keepdims=True)
-    # a fit of 1 + dim numbers leaves this share of what a fit of none would leave of noise
+    # A fit with 1 + dim free numbers leaves this share of the variance of pure noise.
     free = max(each - 1 - dim, 1) / each
     total = np.zeros(count)
     rest = np.zeros(count)

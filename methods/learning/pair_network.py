@@ -28,37 +28,46 @@ if TYPE_CHECKING:
     import torch
 
 LAYERS = ("proposed", "target", "joined", "output")
-"""The fully connected layers; each has a `.weight` (inputs, outputs) and a `.bias` (outputs,)."""
+"""Names of the fully connected layers.
+
+Each has a `.weight` (inputs, outputs) and a `.bias` (outputs,).
+"""
 
 _LOG_2 = float(np.log(2.0))
-"""Softplus at zero; taken off, a unit that hears nothing says nothing."""
+"""Softplus at zero; it is subtracted, so that a unit with input zero has output zero."""
 _TAMED = 30.0
-"""Divides relative squared errors; to Adam only their ratio to the weights' penalty matters."""
+"""Divisor of relative squared errors; for Adam only their ratio to the penalty matters."""
 _SPREAD = 1.7
-"""Limit of initial weights times the root of a layer's inputs: a variance close to 1 / inputs."""
+"""Limit of initial weights times the root of the number of inputs of a layer.
+
+It gives a variance close to 1 / inputs.
+"""
 _COOLING = 0.99
-"""Factor on the published rate from epoch to epoch."""
+"""Factor by which the published learning rate decreases in each epoch."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """How a network is built and trained; the defaults are this project's, `PUBLISHED` the
-    authors'.
+    """Design of a network and of its training.
+
+    The defaults are this project's, those of `PUBLISHED` the authors'.
 
     Attributes:
-        width: units of each branch and of the joined layer.
-        smooth: softplus units (shifted through the origin) in place of rectified linear ones.
-        antisymmetric: h(a, b) = (n(a, b) - n(b, a)) / 2, hence h(o, o) = 0 exactly; else h = n.
-        bounded: tanh at the output.
-        relative: weigh each pair's squared error by 1 / (|difference|^2 + relative^2), unit cube; 0
-            weighs all alike.
-        adam: Adam and a rate falling along a cosine; else SGD without momentum and a rate x 0.99 an
-            epoch.
-        rate: learning rate at the beginning.
+        width: number of units of each branch and of the joined layer.
+        smooth: True for softplus units (shifted through the origin), False for rectified linear
+            ones.
+        antisymmetric: True for h(a, b) = (n(a, b) - n(b, a)) / 2, hence h(o, o) = 0 exactly; False
+            for h = n.
+        bounded: True for tanh at the output.
+        relative: each pair's squared error is weighted by 1 / (|difference|^2 + relative^2), unit
+            cube; 0 gives equal weights.
+        adam: True for Adam with a cosine learning rate; False for SGD without momentum and a rate
+            that is multiplied by 0.99 per epoch.
+        rate: initial learning rate.
         weight_decay: lambda in Eq. 1, per mean squared error.
-        epochs: passes over the training data.
-        batch: scenarios, all of whose pairs are used (published: one pair each, the first member
-            proposed).
+        epochs: number of passes over the training data.
+        batch: number of scenarios, all of whose pairs are used (published: one pair each, the first
+            member proposed).
     """
 
     width: int = 32
@@ -80,7 +89,7 @@ PUBLISHED = Design(
     relative=0.0,
     adam=False,
     rate=0.1,
-    # torch's weight_decay 1e-2 is the gradient of half of it times the squared norm
+    # torch's weight_decay of 1e-2 is the gradient of half of it times the squared norm.
     weight_decay=0.5e-2,
     epochs=200,
     batch=50,
@@ -88,8 +97,12 @@ PUBLISHED = Design(
 
 
 def shapes(inputs: tuple[int, int], width: int, dim: int) -> dict[str, tuple[int, ...]]:
-    """Shape of every weight array by name, in the order of the network; inputs of the proposed and
-    the target side.
+    """Return the shape of every weight array by name, in the order of the network.
+
+    Args:
+        inputs: number of inputs of the proposed and of the target side.
+        width: number of units of a layer.
+        dim: number of parameters.
     """
     sizes = (
         (inputs[0], width),
@@ -105,21 +118,21 @@ def shapes(inputs: tuple[int, int], width: int, dim: int) -> dict[str, tuple[int
 
 
 def estimate(weights: dict[str, Array], design: Design, proposed: Array, target: Array) -> Array:
-    """h(proposed, target): the estimated parameter difference target - proposed.
+    """Compute h(proposed, target), the estimated parameter difference target - proposed.
 
     Args:
-        weights: as in `shapes`.
-        design: how the network is built.
-        proposed: (n, D) input rows of the proposed simulations, or (D,).
-        target: (n, E) or (E,), likewise; E is D where the network is antisymmetric.
+        weights: weight arrays as in `shapes`.
+        design: design of the network.
+        proposed: (n, D) or (D,) input rows of the proposed simulations.
+        target: (n, E) or (E,) input rows of the targets; E is D if the network is antisymmetric.
 
     Returns:
-        (n, dim) or (dim,), unit cube.
+        (n, dim) or (dim,) differences in the unit cube.
     """
     w = weights
 
     def unit(x: Array) -> Array:
-        # smooth ones bend gently beyond the training range, where rectified ones have a corner
+        # Softplus is smooth beyond the training range, where rectified linear units have a corner.
         return np.logaddexp(0.0, x) - _LOG_2 if design.smooth else np.maximum(x, 0.0)
 
     def branch(x: Array, layer: str) -> Array:
@@ -137,11 +150,12 @@ def estimate(weights: dict[str, Array], design: Design, proposed: Array, target:
 
 
 class Sides(NamedTuple):
-    """Input rows of simulations as either side of the network reads them.
+    """Input rows of simulations for both sides of the network.
 
     Attributes:
-        proposed: (scenarios, m, D).
-        target: (scenarios, m, E); the same array where both sides read the same.
+        proposed: (scenarios, m, D) rows of the proposed side.
+        target: (scenarios, m, E) rows of the target side; the same array if both sides have the
+            same inputs.
     """
 
     proposed: Array
@@ -149,8 +163,12 @@ class Sides(NamedTuple):
 
 
 class Watched(NamedTuple):
-    """Held-out data, and who is told of the losses: epoch from 1, number of epochs, training and
-    held-out loss.
+    """Held-out data, and a callback for the losses.
+
+    Attributes:
+        rows: input rows of the held-out data.
+        parameters: (scenarios, m, dim) parameters of the held-out data.
+        epoch: called with the epoch from 1, the number of epochs, training and held-out loss.
     """
 
     rows: Sides
@@ -166,24 +184,24 @@ def train(
     alone: bool = False,
     watched: Watched | None = None,
 ) -> dict[str, Array]:
-    """Fit the weights by Eq. 1, on the CPU; the same generator gives the same weights bit for bit.
+    """Train the weights by Eq. 1 on the CPU; equal generators give bit-identical weights.
 
     Args:
         rows: input rows of both sides.
-        parameters: (scenarios, m, dim), unit cube.
-        design: how the network is built and trained.
-        rng: seeds the initial weights and the order; no global random state is touched.
-        alone: learn parameters from the target alone, the proposed input being zero (the direct
-            regressor).
-        watched: told of the losses, without the penalty on the weights; the weights do not depend
-            on it.
+        parameters: (scenarios, m, dim) parameters in the unit cube.
+        design: design of the network and of its training.
+        rng: seeds the initial weights and the order; global random state is not changed.
+        alone: True to learn parameters from the target alone, with a proposed input of zero (the
+            direct regressor).
+        watched: held-out data and callback for the losses, without the penalty on the weights; the
+            weights do not depend on it.
 
     Returns:
-        Weights as in `shapes`.
+        Weight arrays as in `shapes`.
     """
     import torch
 
-    # layers this small keep a GPU waiting: an H100 takes 1.6 to 2.7 times as long as its host
+    # Layers this small do not use a GPU well: an H100 takes 1.6 to 2.7 times as long as its host.
     with reproducible(), torch.enable_grad():
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         inputs = (rows.proposed.shape[-1], rows.target.shape[-1])
@@ -204,11 +222,14 @@ def train(
 
 @contextmanager
 def reproducible() -> Iterator[None]:
-    """Sums in a fixed order, and the machine's other cores left to other runs."""
+    """Make torch reproducible: one thread, so that sums have a fixed order.
+
+    Other runs can use the machine's other cores.
+    """
     import torch
 
     threads = torch.get_num_threads()
-    # a sum shared out over threads depends on how many there are
+    # A sum that is distributed over threads depends on their number.
     torch.set_num_threads(1)
     try:
         yield
@@ -217,7 +238,7 @@ def reproducible() -> Iterator[None]:
 
 
 def _data(rows: Sides, parameters: Array) -> tuple[Any, Any, Any]:
-    """Rows of both sides and parameters as tensors; one tensor where both sides read the same."""
+    """Convert rows of both sides and parameters to tensors; equal sides share one tensor."""
     import torch
 
     def tensor(array: Array) -> Any:
@@ -232,14 +253,14 @@ def _data(rows: Sides, parameters: Array) -> tuple[Any, Any, Any]:
 def _initial(
     inputs: tuple[int, int], dim: int, design: Design, generator: torch.Generator
 ) -> dict[str, Any]:
-    """Weights uniform in +- gain / sqrt(inputs); biases too (published), or zero."""
+    """Draw initial weights uniform in +- gain / sqrt(inputs); biases too (published), or zero."""
     import torch
 
     weights: dict[str, Any] = {}
     fan_in = 1
     for name, shape in shapes(inputs, design.width, dim).items():
         is_weight = name.endswith("weight")
-        # a layer's bias follows its weights and has their number of inputs
+        # A layer's bias follows its weights and has the same number of inputs.
         fan_in = shape[0] if is_weight else fan_in
         gain = 1.0
         if design.adam:
@@ -251,7 +272,10 @@ def _initial(
 
 
 def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any, Any], Any]:
-    """The data term of (3) of both sides' rows (n, m, D), (n, m, E) and parameters (n, m, dim)."""
+    """Return the data term of (3) as a function of both sides' rows and the parameters.
+
+    The function's arguments are rows (n, m, D), (n, m, E) and parameters (n, m, dim).
+    """
     import torch
     from torch.nn.functional import softplus
 
@@ -269,11 +293,11 @@ def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any,
     def objective(x: Any, seen: Any, y: Any) -> Any:
         b = branch(seen, "target")
         if alone:
-            # a proposed input of zero leaves the branch's bias
+            # A proposed input of zero leaves the branch's bias.
             silent = unit(w["proposed.bias"]).expand_as(b)
             error = joined(silent, b) - y
             return (error**2).sum(dim=-1).mean()
-        # antisymmetric: half of the ordered pairs will do, the other half are mirror images
+        # Half of the ordered pairs is enough, because the network is antisymmetric.
         one, other = torch.triu_indices(x.shape[1], x.shape[1], offset=1)
         a = branch(x, "proposed")
         h = joined(a[:, one], b[:, other])
@@ -282,7 +306,7 @@ def _loss(design: Design, w: dict[str, Any], alone: bool) -> Callable[[Any, Any,
         difference = y[:, other] - y[:, one]
         squares = ((h - difference) ** 2).sum(dim=-1)
         if design.relative:
-            # small differences are what the last steps are made of: they must not drown
+            # Small differences matter in the last steps of tuning, so they must have enough weight.
             sizes = (difference**2).sum(dim=-1) + design.relative**2
             squares = squares / sizes / _TAMED  # (3)
         return squares.mean()
@@ -298,7 +322,7 @@ def _descend(
     generator: torch.Generator,
     watched: Watched | None,
 ) -> None:
-    """Change the weights, in place, by gradients of (3)."""
+    """Minimise (3) by gradient steps that change the weights in place."""
     import torch
 
     x, seen, y = data
@@ -317,7 +341,7 @@ def _descend(
             batch = order[first : first + design.batch]
             optimiser.zero_grad()
             error = loss(x[batch], seen[batch], y[batch])
-            # in the loss and not torch's option, so that it is Eq. 1 for Adam too
+            # The penalty is in the loss and not torch's option, so that it is Eq. 1 for Adam too.
             penalty = design.weight_decay * sum((v**2).sum() for v in weights)
             (error + penalty).backward()
             optimiser.step()

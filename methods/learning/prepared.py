@@ -1,4 +1,4 @@
-"""One learner for targets as clean as the simulations, and one for targets from a sensor."""
+"""Train one network for noise-free targets, and one for noisy targets."""
 
 from __future__ import annotations
 
@@ -14,37 +14,44 @@ from methods.learning.reader import Reading
 from methods.learning.rehearsal import Rehearsal
 
 _CALM = 2.0
-"""A target is as clean as simulations up to this many times their own roughness."""
+"""Maximum roughness of a noise-free target, in multiples of the simulations' roughness."""
 _HEARD = 50.0
-"""A target counts as noisy from so small a part (one in 50) of the noise prepared for."""
+"""Divisor of the training noise that gives the threshold for noisy targets.
+
+A target counts as noisy if its noise exceeds 1/50 of the noise of the training.
+"""
 
 
 class Stored(Protocol):
-    """What was learned, and can be kept."""
+    """Trained network that can be stored."""
 
     def state(self) -> dict[str, Array]:
-        """Everything as plain arrays."""
+        """Return everything as plain arrays by name."""
         ...
 
 
 Learner = TypeVar("Learner", bound=Stored)
 Learn = Callable[[str, Rehearsal, "Array | None"], Learner]
-"""Learns from the simulations of a stage, to which noise of standard deviations (C,) was added."""
+"""Function that trains a network.
+
+Its arguments are the name of the stage, the training data, and the standard deviations (C,) of the
+noise that was added to them; None for noise-free data.
+"""
 
 
 @dataclass(frozen=True)
 class Prepared(Generic[Learner]):
-    """A network for targets as clean as the simulations, and one for targets from a sensor.
+    """One network for noise-free targets, and one for noisy targets.
 
-    The two read different things of an observation: without noise, single samples that follow the
-    parameters exactly even far outside the training range; with noise, what many samples say
-    together.
+    The two networks use different features of an observation. Without noise, single samples follow
+    the parameters exactly even far outside the training range. With noise, a combination of many
+    samples is needed.
 
     Attributes:
-        clean: trained on the simulations as they are; the noisy one again where no target is as
-            clean.
-        noisy: trained on the same simulations with noise added; the clean one again where there is
-            none.
+        clean: network trained on noise-free simulations; the noisy one if noise-free targets are
+            excluded.
+        noisy: network trained on the same simulations with noise; the clean one if there is no
+            noise.
         limit: (C,) roughness above which a target counts as noisy, SI units.
     """
 
@@ -56,8 +63,13 @@ class Prepared(Generic[Learner]):
     def train(
         cls, data: Rehearsal, rng: np.random.Generator, reading: Reading, learn: Learn[Learner]
     ) -> Prepared[Learner]:
-        """Train both networks on the same simulations; only one where `reading` prepares for one
-        kind of target.
+        """Train both networks on the same simulations, or one if one kind of target is expected.
+
+        Args:
+            data: training data.
+            rng: random generator.
+            reading: configuration of the inputs and of the noise.
+            learn: function that trains a network.
         """
         spread = data.flat.std(axis=(0, 1))
         own = roughness(data.flat, data.lengths).max(axis=0)
@@ -67,7 +79,8 @@ class Prepared(Generic[Learner]):
             noise = reading.noise * spread
             return learn("noisy", data.spoilt(noise, rng), noise)
 
-        # a sensor whose errors last looks as smooth as a clean target: then there is one network
+        # Autocorrelated sensor errors look as smooth as a noise-free target, so there is one
+        # network.
         if reading.noise and not reading.clean:
             network = noisy()
             return cls(network, network, limit)
@@ -75,12 +88,12 @@ class Prepared(Generic[Learner]):
         return cls(clean, noisy() if reading.noise else clean, limit)
 
     def suited(self, task: Task) -> Learner:
-        """The network for a target, chosen by the target's roughness."""
+        """Return the network for a target, chosen by the target's roughness."""
         rough = roughness(task.observed[None], task.lengths)[0]
         return self.noisy if (rough > self.limit).any() else self.clean
 
     def state(self) -> dict[str, Array]:
-        """Everything as plain arrays."""
+        """Return everything as plain arrays by name."""
         arrays = {f"clean.{name}": array for name, array in self.clean.state().items()}
         if self.noisy is not self.clean:
             arrays |= {f"noisy.{name}": array for name, array in self.noisy.state().items()}
@@ -93,10 +106,15 @@ class Prepared(Generic[Learner]):
         reading: Reading,
         restore: Callable[[dict[str, Array]], Learner],
     ) -> Prepared[Learner]:
-        """The inverse of `state`.
+        """Restore the networks from the arrays of `state`.
+
+        Args:
+            state: arrays by name.
+            reading: configuration of the inputs and of the noise.
+            restore: function that restores one network from its arrays.
 
         Raises:
-            ValueError: arrays of other names or shapes, or numbers that are not finite.
+            ValueError: arrays have other names or shapes, or numbers that are not finite.
         """
         parts: dict[str, dict[str, Array]] = {"clean": {}, "noisy": {}, "limit": {}}
         for name, array in state.items():
@@ -121,16 +139,20 @@ class Prepared(Generic[Learner]):
 
 
 def heard(apart: Rehearsal, noise: Array | None) -> Rehearsal:
-    """Held-out simulations as a network of this noise (C,) would meet them."""
-    # noise of its own stream: what is learned is the same whether anybody looks
+    """Add noise of standard deviations (C,) to held-out simulations; None for no noise."""
+    # A separate random stream keeps the training independent of the evaluation.
     return apart if noise is None else apart.spoilt(noise, np.random.default_rng(0))
 
 
 def checked(arrays: dict[str, Array], expected: dict[str, tuple[int, ...]]) -> dict[str, Array]:
-    """The arrays in the order of `expected`, which says their shapes by name.
+    """Return the arrays in the order of the expected names, after a check of their shapes.
+
+    Args:
+        arrays: arrays by name.
+        expected: shapes by name.
 
     Raises:
-        ValueError: arrays of other names or shapes, or numbers that are not finite.
+        ValueError: arrays have other names or shapes, or numbers that are not finite.
     """
     if arrays.keys() != expected.keys():
         raise ValueError(f"expected arrays {sorted(expected)}, found {sorted(arrays)}")

@@ -1,4 +1,4 @@
-"""Points that fill a cube more evenly than random ones.
+"""Quasi-random points that fill a cube more evenly than random ones.
 
 An additive recurrence with the generalised golden ratio g (M. Roberts, The unreasonable
 effectiveness of quasirandom sequences, 2018), in d dimensions from the shift s:
@@ -14,15 +14,18 @@ import numpy as np
 from methods.base import Array
 
 _PASSES = 60
-"""Passes after which the fixed point of (1) is exact: each more than halves the error."""
+"""Number of fixed-point iterations for (1); each one more than halves the error."""
 
 
 def spread(count: int, shift: Array) -> Array:
-    """(count, d) points of the unit cube.
+    """Return quasi-random points of the unit cube.
 
     Args:
-        count: how many.
-        shift: (d,) the s of (2).
+        count: number of points.
+        shift: (d,) shift s of (2).
+
+    Returns:
+        (count, d) points.
     """
     dim = len(shift)
     ratio = 2.0

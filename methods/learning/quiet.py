@@ -1,4 +1,4 @@
-"""Calls of packages that print, warn and draw from global generators, made as if they did not."""
+"""Call third-party packages without output, warnings or changes of global random generators."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from methods.learning.pair_network import reproducible
 
 @contextmanager
 def quietly(rng: np.random.Generator) -> Iterator[None]:
-    """Global generators seeded from `rng` inside and as they were outside; one thread, no warnings,
-    nothing printed.
+    """Isolate a call of third-party packages.
+
+    In the block, global generators are seeded from `rng`, one thread is used, and warnings and
+    printed output are suppressed. Global generators are restored afterwards.
     """
     import torch
 
-    # packages draw from NumPy's and torch's global generators, which belong to the caller
+    # Packages draw from NumPy's and torch's global generators, which the caller uses too.
     legacy = np.random.get_state()  # noqa: NPY002 - it is what is guarded
     seed = int(rng.integers(2**62))
     with (
@@ -38,7 +40,7 @@ def quietly(rng: np.random.Generator) -> Iterator[None]:
 
 
 class Silent:
-    """A tracker of training that keeps nothing; the package's own writes files where it runs."""
+    """Training tracker that records nothing; a package's own tracker writes files."""
 
     log_dir = None
 

@@ -1,6 +1,4 @@
-"""What learned tuners read: from observations, and what is known of their scenarios, to a network's
-input rows.
-"""
+"""Map from observations and scenario information to the input rows of learned tuners."""
 
 from __future__ import annotations
 
@@ -14,31 +12,31 @@ from methods.learning.pair_inputs import Inputs, raw_inputs, weighed_inputs
 from methods.learning.rehearsal import Rehearsal
 
 _SEEN = ("chosen", "centre", "gain")
-"""Arrays of `Inputs` that are stored."""
+"""Names of the arrays of `Inputs` that are stored."""
 _TOLD = ("centre", "spread", "initial")
-"""Arrays of `Circumstances` that are stored."""
+"""Names of the arrays of `Circumstances` that are stored."""
 _NONE = np.empty(0)
-"""Stands for an array that is not there."""
+"""Replacement of a missing array."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What networks read of an observation, and the noise that they prepare for.
+    """Configuration of network inputs and of the noise in training.
 
     Attributes:
-        points: points to which each run is resampled; L in Algorithm 1.
-        inputs: inputs kept of those an observation offers.
+        points: number of points to which each run is resampled; L in Algorithm 1.
+        inputs: maximum number of inputs that are used from an observation.
         strictness: see `methods.learning.pair_inputs.weighed_inputs`.
-        noise: sensor noise that a second network is trained with, 1 sigma, in units of each
-            channel's standard deviation in training; 0 for no second network.
-        raw: the resampled series in SI units as they are, as published; the other settings say
-            nothing then.
-        told: read what is known of a scenario too, where scenarios differ in it
+        noise: sensor noise that a second network is trained with, as standard deviation in units of
+            each channel's standard deviation in training; 0 for no second network.
+        raw: True for the resampled series in SI units without weights, as published; the other
+            settings then have no effect.
+        told: True to use scenario information too, if scenarios differ in it
             (`methods.learning.circumstances`).
-        channels: the first and the last of the channels that are read, by number; None for all.
-        clean: whether targets may be as clean as simulations; else one network is trained, with the
-            noise.
-        proposed: what the network's proposed side reads, where that is something else.
+        channels: indices of the first and the last channel that are used; None for all.
+        clean: whether targets may be noise-free; if not, only the network for noisy targets is
+            trained.
+        proposed: configuration of the inputs of the network's proposed side, if it differs.
     """
 
     points: int = 400
@@ -52,8 +50,9 @@ class Reading:
     proposed: Reading | None = None
 
     def part(self, observations: Array) -> Array:
-        """The channels (..., c) that are read of observations (..., C); the last one if there are
-        too few.
+        """Return the channels (..., c) of observations (..., C) that are used.
+
+        Indices beyond the last channel are replaced by the last one.
         """
         if self.channels is None:
             return observations
@@ -64,12 +63,13 @@ class Reading:
 
 @dataclass(frozen=True)
 class Reader:
-    """A map to input rows, chosen and scaled by the training simulations.
+    """Map to input rows, chosen and scaled by the training simulations.
 
     Attributes:
-        reading: how it was chosen.
-        seen: observations to input rows.
-        told: what is known of scenarios to further inputs; None where they were alike in training.
+        reading: configuration from which it was made.
+        seen: map from observations to input rows.
+        told: map from scenario information to further inputs; None if scenarios were equal in
+            training.
     """
 
     reading: Reading
@@ -78,14 +78,19 @@ class Reader:
 
     @classmethod
     def learned(cls, data: Rehearsal, reading: Reading) -> Reader:
-        """Choose what to read."""
+        """Choose the inputs from training data.
+
+        Args:
+            data: training data.
+            reading: configuration of the inputs.
+        """
         data = data._replace(observations=reading.part(data.observations))
         if reading.raw:
             return cls(reading, raw_inputs(data.flat, data.lengths, reading.points))
         told = None
         if reading.told:
             told = Circumstances.learned(data.scenes, data.observations, data.lengths)
-        # where inputs vary, samples mean something else in each scenario: responses alone are read
+        # If inputs vary, samples have another meaning in each scenario, so only responses are used.
         driven = told is not None and told.driven
         most = 0 if driven else reading.inputs
         seen = weighed_inputs(data, reading.points, most, reading.strictness)
@@ -93,7 +98,7 @@ class Reader:
 
     @property
     def size(self) -> int:
-        """Numbers in a row."""
+        """Length of an input row."""
         told = 0 if self.told is None else self.told.centre.size
         return self.seen.chosen.size + told
 
@@ -104,17 +109,18 @@ class Reader:
         scene: Scene,
         missing: Array | None = None,
     ) -> Array:
-        """Input rows (n, D) of observations (n, T, C) made in one scene.
+        """Compute input rows (n, D) from observations (n, T, C) of one scenario.
 
         Args:
-            observations: SI units; NaN where a sample is missing.
-            lengths: samples of each run.
-            scene: what is known of the scenario.
-            missing: (T, C) samples to be treated as missing as well: those of the target, so that a
-                simulation of the true parameters gives the target's own row.
+            observations: observations in SI units; NaN for missing samples.
+            lengths: number of samples of each run.
+            scene: scenario information.
+            missing: (T, C) mask of further samples to treat as missing: those missing in the
+                target, so that a simulation with the true parameters gives the target's own row.
 
         Raises:
-            ValueError: the observation or the scene is of another kind than in training.
+            ValueError: the observation or the scenario differs in its shape from those of the
+                training.
         """
         if missing is not None and missing.any():
             observations = np.where(missing, np.nan, observations)
@@ -126,16 +132,17 @@ class Reader:
         return np.concatenate([rows, further], axis=1)
 
     def table(self, data: Rehearsal) -> Array:
-        """Input rows (scenarios, each, D) of training simulations."""
+        """Compute the input rows (scenarios, each, D) of training simulations."""
         if self.told is None:
-            # all scenarios in one call: nothing depends on which a simulation was made in
+            # All scenarios are computed in one call, because the rows do not depend on the
+            # scenario.
             rows = self.seen(self.reading.part(data.flat), data.lengths)
             return rows.reshape(*data.parameters.shape[:2], -1)
         each = zip(data.observations, data.scenes, strict=True)
         return np.array([self(observations, data.lengths, scene) for observations, scene in each])
 
     def state(self) -> dict[str, Array]:
-        """Everything as plain arrays."""
+        """Return everything as plain arrays by name."""
         state: dict[str, Array] = {}
         for name in _SEEN:
             state[f"inputs.{name}"] = np.asarray(getattr(self.seen, name))
@@ -146,16 +153,23 @@ class Reader:
 
     @classmethod
     def restored(cls, state: dict[str, Array], reading: Reading) -> tuple[Reader, dict[str, Array]]:
-        """The inverse of `state`, and the arrays of other names.
+        """Restore the map from the arrays of `state`.
+
+        Args:
+            state: arrays by name.
+            reading: configuration of the inputs.
+
+        Returns:
+            The map, and the arrays of other names.
 
         Raises:
-            ValueError: arrays that are missing or of other shapes, or numbers that are not finite.
+            ValueError: arrays are missing or have other shapes, or numbers that are not finite.
         """
         rest = {name: np.array(array, dtype=np.float64) for name, array in state.items()}
         names = [f"inputs.{name}" for name in _SEEN]
         if any(name.startswith("told.") for name in rest):
             names += [f"told.{name}" for name in _TOLD]
-        # one array of each part says how long the others must be
+        # The shape of one array of each part determines the shapes of the others.
         sizes = {part: rest.get(f"{part}.centre", _NONE).shape for part in ("inputs", "told")}
         for name in names:
             shape = () if name == "told.initial" else sizes[name.partition(".")[0]]

@@ -10,18 +10,18 @@ import numpy as np
 from methods.base import Array, Practice, Scene
 
 _LEAST = 2
-"""Scenarios; from one alone nobody learns what scenarios differ in."""
+"""Minimum number of scenarios; one alone gives no information about their differences."""
 
 
 class Rehearsal(NamedTuple):
     """Training simulations: several in each scenario.
 
     Attributes:
-        parameters: (scenarios, each, dim), unit cube.
-        observations: (scenarios, each, T, C), SI units.
-        lengths: samples of each run.
-        scenes: what is known of each scenario.
-        unspoilt: the simulations before noise was added; None where none was.
+        parameters: (scenarios, each, dim) parameters in the unit cube.
+        observations: (scenarios, each, T, C) observations in SI units.
+        lengths: number of samples of each run.
+        scenes: scenario information of each scenario.
+        unspoilt: the data before noise was added; None if no noise was added.
     """
 
     parameters: Array
@@ -32,27 +32,38 @@ class Rehearsal(NamedTuple):
 
     @property
     def pure(self) -> Rehearsal:
-        """The simulations without noise."""
+        """Training data without noise."""
         return self if self.unspoilt is None else self.unspoilt
 
     @property
     def flat(self) -> Array:
-        """All observations (scenarios * each, T, C), one after another."""
+        """All observations (scenarios * each, T, C), concatenated over scenarios."""
         return self.observations.reshape(-1, *self.observations.shape[2:])
 
     def spoilt(self, noise: Array, rng: np.random.Generator) -> Rehearsal:
-        """The same with white noise of standard deviations (C,) added."""
+        """Return the data with white noise added.
+
+        Args:
+            noise: (C,) standard deviations of the noise.
+            rng: random generator.
+        """
         errors = noise * rng.standard_normal(self.observations.shape)
-        # the proposed side of a network sees simulations, so they are kept as they were
+        # Noise-free data are kept for the proposed side of a network, which reads simulations.
         return self._replace(observations=self.observations + errors, unspoilt=self.pure)
 
 
 class TooFewError(ValueError):
-    """A training budget that does not last for what is learned from it."""
+    """The training budget is too small for the tuner."""
 
 
 def uniform(simulator: Practice, rng: np.random.Generator, count: int) -> Array:
-    """Points (count, dim) drawn evenly from the training range."""
+    """Draw points (count, dim) uniformly from the training range.
+
+    Args:
+        simulator: training simulator.
+        rng: random generator.
+        count: number of points.
+    """
     return simulator.sample(rng, count)
 
 
@@ -64,13 +75,21 @@ def rehearse(
     each: int,
     drawn: Callable[[Practice, np.random.Generator, int], Array] = uniform,
 ) -> Rehearsal:
-    """Simulate `each` points, drawn by `drawn`, in each of `scenarios` scenarios, fewer scenarios
-    if the budget is small.
+    """Simulate several points in each of several scenarios; fewer scenarios for a small budget.
+
+    Args:
+        simulator: training simulator.
+        rng: random generator.
+        budget: maximum number of simulations.
+        scenarios: maximum number of scenarios.
+        each: number of points in each scenario.
+        drawn: function that draws the points of a scenario.
 
     Raises:
-        TooFewError: the budget does not last for two scenarios.
+        TooFewError: the budget is smaller than two scenarios.
+        ValueError: fewer than two scenarios could be simulated.
     """
-    # whole scenarios only: pairs are made within one
+    # Only complete scenarios are simulated, because pairs are formed within a scenario.
     count = min(scenarios, budget // each)
     if count < _LEAST:
         raise TooFewError(
@@ -82,7 +101,8 @@ def rehearse(
     for _ in range(count):
         points = drawn(simulator, rng, each)
         simulated = simulator.simulate(rng, points)
-        # a scenario with a failed simulation goes as a whole: arrays need as many in each
+        # A scenario with a failed simulation is left out, because all need the same number of
+        # points.
         if np.isfinite(simulated).all():
             parameters.append(points)
             observations.append(simulated)

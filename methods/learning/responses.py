@@ -1,7 +1,6 @@
-"""How an observation responds to the inputs of its scenario: coefficients of a fitted equation of
-motion.
+"""Coefficients of a fitted equation of motion: how an observation responds to its inputs.
 
-Each channel's acceleration is fitted by what the channels q and inputs u do at the time:
+Each channel's acceleration is fitted by terms of the channels q and inputs u at the same time:
 
     (1)  q'' = k0 + k1 q + k3 q^3 + kf sense(q') + ku u + kd q'
 
@@ -23,30 +22,35 @@ from methods.base import Array
 from methods.learning.pair_inputs import resample
 
 _SIDE_BY_SIDE = 12
-"""Bumps that would fill a run; they overlap, each moved by an eighth of its width."""
+"""Number of bumps that would fill a run without overlap.
+
+They overlap: successive bumps are shifted by an eighth of their width.
+"""
 _LEAST = 7
-"""Samples of the shortest run that holds a bump of half width 3."""
+"""Minimum number of samples of a run, for a bump of half width 3."""
 _STEEPNESS = 10.0
-"""A rate of change is wholly one way at a fraction of its mean size."""
+"""Factor in the smoothed sign: it saturates at a fraction of the mean rate of change."""
 _ZERO = 1e-300
-"""Added to sizes by which is divided: a signal that is nothing stays nothing."""
+"""Minimum divisor, so that a zero signal stays zero."""
 _RIDGE = 1e-6
-"""Per mean square of a regressor: two that say the same, a constant input and 1, share a
-coefficient.
+"""Ridge parameter, per mean square of a regressor.
+
+With it, two collinear regressors, such as a constant input and 1, share a coefficient.
 """
 
 
 def responses(observations: Array, inputs: Array, lengths: tuple[int, ...]) -> Array:
-    """Coefficients of each run's channels, time being counted in samples.
+    """Compute the coefficients of (1) for each run and channel, with time in samples.
 
     Args:
-        observations: (n, T, C), the runs following one another along T; NaN where a sample is
-            missing.
-        inputs: (T, U) of the scenario in which all were made.
-        lengths: samples of each run; one of fewer than seven gives none.
+        observations: (n, T, C) observations with the runs concatenated along T; NaN for missing
+            samples.
+        inputs: (T, U) inputs of the scenario of all observations.
+        lengths: number of samples of each run; a run of fewer than seven gives no coefficients.
 
     Returns:
-        (n, runs * C * (1 + 4 C + U)): for each channel those of (1), every term of every channel.
+        (n, runs * C * (1 + 4 C + U)) coefficients: for each channel those of (1), with the terms of
+        every channel.
     """
     coefficients = [np.empty((len(observations), 0))]
     first = 0
@@ -55,7 +59,7 @@ def responses(observations: Array, inputs: Array, lengths: tuple[int, ...]) -> A
         first += length
         if length < _LEAST:
             continue
-        # resampling to the run's own length bridges what is missing and changes nothing else
+        # Resampling to the run's own length fills missing samples and changes nothing else.
         whole = resample(observations[:, run], (length,), length)
         series = np.nan_to_num(whole).transpose(0, 2, 1)
         coefficients.append(_response(series, inputs[run]))
@@ -63,13 +67,13 @@ def responses(observations: Array, inputs: Array, lengths: tuple[int, ...]) -> A
 
 
 def _response(series: Array, inputs: Array) -> Array:
-    """(n, C * R) of one run: series (n, T, C), inputs (T, U)."""
+    """Compute the coefficients (n, C * R) of one run from series (n, T, C) and inputs (T, U)."""
     half = max(3, series.shape[1] // (2 * _SIDE_BY_SIDE))
     width = half + 1
     s = np.arange(-half, half + 1) / (half + 1.0)
     inside = 1 - s**2
     bump = inside**4  # (3)
-    # its derivatives by samples, w' and w''
+    # Derivatives w' and w'' of the bump, per sample.
     slope = -8 * s * inside**3 / width
     bend = (48 * s**2 * inside**2 - 8 * inside**3) / width**2
     stride = max(1, half // 4)
@@ -78,12 +82,12 @@ def _response(series: Array, inputs: Array) -> Array:
         windows = sliding_window_view(signal, len(s), axis=1)[:, ::stride]
         return np.asarray(windows @ kernel, dtype=np.float64)
 
-    # an input is held until the next sample: around a sample it is half the old, half the new one
+    # An input is constant until the next sample, so around a sample it is the mean of two values.
     earlier = np.concatenate([inputs[:1], inputs[:-1]])
     held = (inputs + earlier) / 2.0
     driven = np.broadcast_to(held, (len(series), *inputs.shape))
     constant = np.ones_like(driven[..., :1])
-    # the terms of (1) but the last, which has a derivative of its own
+    # All terms of (1) except the last one, which needs the derivative w'.
     plain = np.concatenate([constant, series, series**3, _sense(series), driven], axis=2)
     regressors = np.concatenate([integral(plain, bump), -integral(series, slope)], axis=2)  # (2)
     accelerations = integral(series, bend)  # (2)
@@ -91,20 +95,23 @@ def _response(series: Array, inputs: Array) -> Array:
 
 
 def _sense(series: Array) -> Array:
-    """Smoothed signs of the rates of change (n, T, C): what dry friction follows."""
-    # slopes of straight lines through seven samples; noise would turn a single difference's sign
+    """Compute smoothed signs of the rates of change (n, T, C), a regressor for dry friction."""
+    # Slopes of lines through seven samples; noise would change the sign of single differences.
     reach = np.arange(-3, 4)
     line = reach / (reach**2).sum()
     padded = np.pad(series, ((0, 0), (3, 3), (0, 0)), mode="edge")
     rates = sliding_window_view(padded, len(reach), axis=1) @ line
     typical = np.abs(rates).mean(axis=1, keepdims=True) + _ZERO
-    # tanh in place of a sign, which would jump where noise crosses zero
+    # tanh replaces the sign function, which would jump where noise crosses zero.
     return np.asarray(np.tanh(_STEEPNESS * rates / typical), dtype=np.float64)
 
 
 def _fitted(regressors: Array, values: Array) -> Array:
-    """Least squares (n, R, C) of values (n, J, C) on regressors (n, J, R), each lane for itself."""
-    # scaled to mean square 1, so that the ridge means the same for every regressor
+    """Compute ridge least squares (n, R, C) of values (n, J, C) on regressors (n, J, R).
+
+    Each of the n observations is fitted separately.
+    """
+    # Scaled to mean square 1, so that the ridge has the same effect on every regressor.
     size = np.sqrt((regressors**2).mean(axis=1, keepdims=True)) + _ZERO
     scaled = regressors / size
     across = scaled.transpose(0, 2, 1)

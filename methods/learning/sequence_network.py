@@ -1,4 +1,4 @@
-"""A causal transformer that reads a tuning history and says what to try next.
+"""Causal transformer that reads a tuning history and proposes the next point.
 
 Source: X. Zhang, S. Liu et al., Dynamics as Prompts: In-Context Learning for Sim-to-Real System
 Identifications (CAPTURE), IEEE RA-L 2025, arXiv 2410.20357, section III; attention: A. Vaswani et
@@ -13,8 +13,8 @@ widths from the middle of the training range:
     (4)  h = blocks of attention to the tokens before, and of two layers, on the token's embedding
     (5)  next = e + s (A(h) u + c(h)), A and c linear in h; before any simulation: linear in h
 
-so that next = e where a simulation shows what the target shows, and what is left over shrinks with
-the difference. Published: next is linear in h always.
+With (5), next = e if the simulation equals the target, and the step decreases with the difference.
+Published: next is always linear in h.
 """
 
 from __future__ import annotations
@@ -25,29 +25,30 @@ from typing import Any
 import numpy as np
 
 _QUIET = 0.01
-"""s0 in (3): differences far below those of training all look alike."""
+"""Constant s0 in (3): differences far below those of the training give equal tokens."""
 _STILL = 1e-9
-"""Keeps quotients of nothing and nothing finite."""
+"""Minimum divisor, so that zero divided by zero is finite."""
 _FAR = 1e9
-"""Taken off what tokens that come later would be heard with."""
+"""Value subtracted from attention scores of later tokens (causal mask)."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """How a network is built and trained.
+    """Design of a network and of its training.
 
     Attributes:
-        window: simulations of a history that it looks back at.
-        seen: size of d in (1).
-        width: of a token's embedding and of the layers of a block.
-        blocks: blocks of attention and layers.
-        published: learn the next point of a randomised binary search, as a linear function of h;
-            else learn the target's parameters, by (5).
-        relative: weigh each squared error by 1 / (|e - truth|^2 + relative^2), half widths.
-        rate: learning rate at the beginning; it falls along a cosine.
-        weight_decay: times the squared norm of the weights, added to the loss.
-        epochs: passes over the scenarios.
-        batch: scenarios in a batch.
+        window: number of simulations of a history that the network reads.
+        seen: length of d in (1).
+        width: width of a token's embedding and of the layers of a block.
+        blocks: number of blocks of attention and layers.
+        published: True to learn the next point of a randomised binary search, as a linear function
+            of h; False to learn the target's parameters, by (5).
+        relative: each squared error is weighted by 1 / (|e - truth|^2 + relative^2), in half
+            widths.
+        rate: initial learning rate; it decreases along a cosine.
+        weight_decay: factor of the squared norm of the weights in the loss.
+        epochs: number of passes over the scenarios.
+        batch: number of scenarios in a batch.
     """
 
     window: int = 7
@@ -63,7 +64,13 @@ class Design:
 
 
 def shapes(inputs: int, dim: int, design: Design) -> dict[str, tuple[int, ...]]:
-    """Shape of every weight array by name; `inputs` numbers in a row, `dim` parameters."""
+    """Return the shape of every weight array by name.
+
+    Args:
+        inputs: length of an input row.
+        dim: number of parameters.
+        design: design of the network.
+    """
     d, width = design.seen, design.width
     layers = {"first": (d, width), "token": (3 * d + 1 + 2 * dim, width)}
     for block in range(design.blocks):
@@ -72,7 +79,7 @@ def shapes(inputs: int, dim: int, design: Design) -> dict[str, tuple[int, ...]]:
             layers[f"{part}{block}"] = width, width
     layers["guess"] = width, dim
     layers["next"] = width, dim if design.published else dim * (d + 1)
-    # a bias would fall out of every difference
+    # The projection has no bias, because a bias would cancel in every difference.
     named: dict[str, tuple[int, ...]] = {"seen.weight": (inputs, d)}
     for layer, (fan_in, fan_out) in layers.items():
         named[f"{layer}.weight"] = fan_in, fan_out
@@ -85,20 +92,20 @@ def shapes(inputs: int, dim: int, design: Design) -> dict[str, tuple[int, ...]]:
 def proposals(
     xp: Any, w: dict[str, Any], design: Design, target: Any, shown: Any, tried: Any
 ) -> Any:
-    """What is proposed before and after each simulation of a history.
+    """Compute the proposals before and after each simulation of a history.
 
-    Written once for numpy and torch, which call what it needs by the same names.
+    The code is shared by numpy and torch, whose functions have the same names.
 
     Args:
-        xp: numpy or torch.
-        w: arrays as in `shapes`.
-        design: how the network is built.
-        target: (..., d) the target's row through W.
-        shown: (..., k, d) rows of the simulations through W; k is at most the window.
-        tried: (..., k, dim) their parameters, in half widths from the middle.
+        xp: module numpy or torch.
+        w: weight arrays as in `shapes`.
+        design: design of the network.
+        target: (..., d) row of the target, projected by W.
+        shown: (..., k, d) rows of the simulations, projected by W; k is at most the window.
+        tried: (..., k, dim) parameters of the simulations, in half widths from the middle.
 
     Returns:
-        (..., k + 1, dim), in the same unit.
+        (..., k + 1, dim) proposals, in half widths from the middle.
     """
     here = target[..., None, :]
     far = shown - here
@@ -120,7 +127,7 @@ def proposals(
 
 
 def _stepped(xp: Any, far: Any, tried: Any) -> tuple[Any, Any]:
-    """The direction of each step and (2); zeros for the first simulation."""
+    """Compute the direction of each step and the slope (2); zeros for the first simulation."""
     step = tried[..., 1:, :] - tried[..., :-1, :]
     length = xp.sqrt((step**2).sum(axis=-1, keepdims=True) + _STILL**2)
     slope = (far[..., 1:, :] - far[..., :-1, :]) / length  # (2)
@@ -132,7 +139,7 @@ def _stepped(xp: Any, far: Any, tried: Any) -> tuple[Any, Any]:
 
 
 def _attended(xp: Any, w: dict[str, Any], block: int, h: Any) -> Any:
-    """Attention of each token (..., k, width) to those before it and to itself."""
+    """Compute the attention of each token (..., k, width) to itself and to earlier tokens."""
     count, width = h.shape[-2:]
     heard = _linear(w, f"heard{block}", h)
     query, key = heard[..., :width], heard[..., width : 2 * width]
@@ -140,7 +147,7 @@ def _attended(xp: Any, w: dict[str, Any], block: int, h: Any) -> Any:
     later = xp.asarray(np.where(lag < 0, _FAR, 0.0).astype(np.float32))
     score = query @ key.swapaxes(-1, -2) / width**0.5 + w[f"lag{block}.bias"][np.maximum(lag, 0)]
     score = score - later
-    # the largest taken off: exponentials must not overflow
+    # The largest score is subtracted, so that the exponentials do not overflow.
     share = xp.exp(score - xp.amax(score, -1)[..., None])
     share = share / share.sum(axis=-1, keepdims=True)
     return _linear(w, f"mixed{block}", share @ heard[..., 2 * width :])
@@ -151,5 +158,5 @@ def _linear(w: dict[str, Any], layer: str, x: Any) -> Any:
 
 
 def _unit(xp: Any, x: Any) -> Any:
-    """The logistic unit: x times its logistic function, as a tanh, which does not overflow."""
+    """Compute x times its logistic function (swish), with a tanh that does not overflow."""
     return x * (1.0 + xp.tanh(x / 2.0)) / 2.0

@@ -1,4 +1,4 @@
-"""Training of the network that reads tuning histories (`methods.learning.sequence_network`).
+"""Train the network that reads tuning histories (`methods.learning.sequence_network`).
 
 Source: X. Zhang, S. Liu et al., IEEE RA-L 2025, arXiv 2410.20357, Algorithm 2. With e_i the
 simulations of a history and t the target's parameters:
@@ -6,7 +6,7 @@ simulations of a history and t the target's parameters:
     (1)  loss = mean |first guess - t|^2 + |next after e_i - t|^2 / (|e_i - t|^2 + relative^2)
     (2)  published: loss = mean |next after e_i - e_(i + 1)|^2
 
-Both get lambda |weights|^2.
+The penalty lambda |weights|^2 is added to both.
 """
 
 from __future__ import annotations
@@ -25,22 +25,28 @@ if TYPE_CHECKING:
     import torch
 
 _SPREAD = 1.7
-"""Limit of initial weights times the root of a layer's inputs: a variance close to 1 / inputs."""
+"""Limit of initial weights times the root of the number of inputs of a layer.
+
+It gives a variance close to 1 / inputs.
+"""
 _SMALL = 0.3
-"""Of that, for layers whose sum with something else is what counts: they begin as hardly anything.
+"""Factor of the initial weights of layers whose output is added to another value.
+
+With small weights these layers initially change the sum only a little.
 """
 _SUMMED = ("mixed", "outer", "guess", "next")
 _TAMED = 1.0 / 3.0
-"""Times relative squared errors, beside those of the first guess."""
+"""Factor of relative squared errors, compared with the errors of the first guess."""
 
 
 class Material(NamedTuple):
-    """What is learned from.
+    """Training data of the network.
 
     Attributes:
-        shown: (scenarios, m, D) input rows of simulations.
-        target: (scenarios, m, D) of the same where they are targets.
-        parameters: (scenarios, m, dim), in half widths from the middle of the training range.
+        shown: (scenarios, m, D) input rows of the simulations.
+        target: (scenarios, m, D) input rows of the same simulations as targets.
+        parameters: (scenarios, m, dim) parameters, in half widths from the middle of the training
+            range.
     """
 
     shown: Array
@@ -48,15 +54,18 @@ class Material(NamedTuple):
     parameters: Array
 
     def tensors(self) -> list[Any]:
-        """For torch."""
+        """Convert the arrays to torch tensors."""
         import torch
 
         return [torch.as_tensor(array, dtype=torch.float32) for array in self]
 
 
 class Watched(NamedTuple):
-    """Held-out material, and who is told of the losses: epoch from 1, number of epochs, training
-    and held-out loss.
+    """Held-out data, and a callback for the losses.
+
+    Attributes:
+        material: held-out data.
+        epoch: called with the epoch from 1, the number of epochs, training and held-out loss.
     """
 
     material: Material
@@ -70,17 +79,18 @@ def train(
     rng: np.random.Generator,
     watched: Watched | None = None,
 ) -> dict[str, Array]:
-    """Fit the weights; the same generator gives the same weights bit for bit.
+    """Train the weights; equal generators give bit-identical weights.
 
     Args:
-        material: what is learned from.
-        drawn: draws the histories of a batch.
-        design: how the network is built and trained.
-        rng: seeds the initial weights and all that is drawn; no global random state is touched.
-        watched: told of the losses, without the penalty; the weights do not depend on it.
+        material: training data.
+        drawn: function that draws the histories of a batch.
+        design: design of the network and of its training.
+        rng: seeds the initial weights and all random draws; global random state is not changed.
+        watched: held-out data and callback for the losses, without the penalty; the weights do not
+            depend on it.
 
     Returns:
-        Weights as in `shapes`.
+        Weight arrays as in `shapes`.
     """
     import torch
 
@@ -93,7 +103,7 @@ def train(
 
 
 def _initial(named: dict[str, tuple[int, ...]], generator: torch.Generator) -> dict[str, Any]:
-    """Weights uniform in +- gain / sqrt(inputs); biases zero."""
+    """Draw initial weights uniform in +- gain / sqrt(inputs); biases are zero."""
     import torch
 
     w: dict[str, Any] = {}
@@ -115,12 +125,12 @@ def _descend(
     rng: np.random.Generator,
     watched: Watched | None,
 ) -> None:
-    """Change the weights, in place, by Adam."""
+    """Minimise the loss with Adam; the weights are changed in place."""
     import torch
 
     parts = material.tensors()
     apart = watched and watched.material.tensors()
-    # torch's weight_decay is the gradient of half of it times the squared norm
+    # torch's weight_decay is the gradient of half of it times the squared norm.
     decay = 2.0 * design.weight_decay
     optimiser: Any = torch.optim.Adam(list(w.values()), design.rate, weight_decay=decay, fused=True)
     for epoch in range(design.epochs):
@@ -137,7 +147,7 @@ def _descend(
             optimiser.step()
             losses.append(error.detach())
         if watched and apart:
-            # a stream of its own: what is learned is the same whether anybody looks
+            # A separate random stream keeps the training independent of the evaluation.
             chosen = drawn(np.random.default_rng(0))
             with torch.no_grad():
                 held_out = float(_loss(w, design, apart, chosen))
@@ -146,7 +156,7 @@ def _descend(
 
 
 def _loss(w: dict[str, Any], design: Design, parts: list[Any], chosen: Histories) -> Any:
-    """(1), or (2), over scenarios and their histories."""
+    """Compute the loss (1), or (2) if published, over scenarios and their histories."""
     import torch
 
     shown, target, parameters = parts
@@ -158,7 +168,7 @@ def _loss(w: dict[str, Any], design: Design, parts: list[Any], chosen: Histories
     if design.published:
         return ((out[:, :, 1:-1] - tried[:, :, 1:]) ** 2).mean()  # (2)
     squares = ((out - truth) ** 2).sum(dim=-1)
-    # small distances are what the last steps are made of: they must not drown
+    # Small distances matter in the last steps of tuning, so they must have enough weight.
     distances = ((tried - truth) ** 2).sum(dim=-1) + design.relative**2
     parts = [squares[:, :, :1], squares[:, :, 1:] / distances * _TAMED]
     return torch.cat(parts, dim=2).mean()  # (1)
