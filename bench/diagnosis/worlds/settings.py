@@ -65,9 +65,7 @@ class Noise:
         """
         sigma = np.array(list(self.sigma.values()))
         white = rng.standard_normal(observed.shape)
-        if (
-            self.kind == "quantised"
-        ):  # the error of rounding has the standard deviation step / sqrt(12)
+        if self.kind == "quantised":  # rounding has the standard deviation step / sqrt(12)
             step = sigma / np.sqrt(1 / 12 + self.dither**2)
             rounded: Array = np.round((observed + self.dither * step * white) / step) * step
             return rounded

@@ -124,7 +124,7 @@ def _rate(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
 
 
 def _quadratic(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """Draw friction whose quadratic part is at least as large as the linear one at the peak force."""
+    """Draw friction whose quadratic part exceeds the linear one at the peak force."""
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     square = float(far * rng.uniform(2.0, 6.0) / peak)
     return lambda s: (0.5 * far * s, square * s)
@@ -239,7 +239,7 @@ def _begins(setting: Setting, lasting: float, rng: np.random.Generator) -> list[
 
 
 def _patch(setting: Setting, rng: np.random.Generator) -> Shape:
-    """Draw a region of dry friction within the travel, 0.14 to 0.3 of it wide."""
+    """Draw a region of dry friction, 0.14 to 0.3 of the central 80 % of positions wide."""
     low, high = np.quantile(np.concatenate(_bare(setting)), [0.1, 0.9])
     half = float((high - low) * rng.uniform(0.07, 0.15))
     centre = float(rng.uniform(low + half, high - half))
@@ -262,7 +262,7 @@ def _ageing(setting: Setting, rng: np.random.Generator) -> Shape:
 
 
 def _latch(setting: Setting, rng: np.random.Generator) -> Shape:
-    """Draw a soft stop in every other run, which the motion reaches for a small part of the time."""
+    """Draw a soft stop in every other run, which the motion reaches for a short time."""
     place = float(np.quantile(np.concatenate(_bare(setting)), rng.uniform(0.7, 0.85)))
     far = 10.0 if setting.system == "pendulum" else 2000.0
     return lambda s: (far * s, place)

@@ -1,4 +1,4 @@
-"""Causes that can be hidden in a machine, their places, and coefficients as functions of a strength.
+"""Causes that can be hidden in a machine: their places, and coefficients by strength.
 
 Strength 1 is the upper end of the plausible range.
 """

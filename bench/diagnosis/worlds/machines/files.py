@@ -41,7 +41,7 @@ def model_file(numbers: Mapping[str, float]) -> str:
 
 
 def _link(body: str, joint: str, n: Mapping[str, float]) -> str:
-    """Render the inertia and joint of a link; its inertia about its own axis is a tenth of the others."""
+    """Render the inertia and joint of a link; it is slender along its own axis."""
     moments = f"{n['inertia']!r} {n['inertia']!r} {0.1 * n['inertia']!r}"
     return (
         f'<inertial pos="0 0 {-n["centre"]!r}" mass="{n["mass"]!r}" diaginertia="{moments}"/>\n'

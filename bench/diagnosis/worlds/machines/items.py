@@ -27,7 +27,7 @@ from sims.base import Array
 SYSTEMS = tuple(PLANTS)
 """Names of the machines."""
 APART = 1.0
-"""Minimum RMS residual, in units of the noise, with one of two effects or without a foreign cause."""
+"""Minimum RMS residual, in noises, with only one of two effects or without a foreign cause."""
 TELLING = 0.4
 """Minimum RMS residual in noises with the simpler form of an effect; below it, that is correct."""
 SIMPLER = {"friction.stribeck": "friction.coulomb"}

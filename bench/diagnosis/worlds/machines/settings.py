@@ -28,7 +28,7 @@ RATES = (50, 100)
 FARTHEST = 1.4
 """Maximum joint angle from hanging down, rad; beyond it a small force decides the motion."""
 TRIES = 8
-"""Maximum number of attempts to draw commands, weaker each time, that keep within the angle limit."""
+"""Maximum number of attempts to scale commands down until the joints keep their angle limit."""
 
 
 @dataclass(frozen=True)
