@@ -100,7 +100,7 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
 
 
 def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicable | None:
-    """Check that an effect family equals all its members with the same coefficients, bit for bit."""
+    """Check that an effect family equals its members with the same coefficients, bit for bit."""
     kind = arm(effect)
     families = [one for one in placed(effect) if hasattr(one, "members")]
     for whole in families:

@@ -50,7 +50,7 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
 
 
 def _housed_as(kind: type[Tuner]) -> Tuned | None:
-    """Return the tuner specification for an isolated process; None if the class cannot be loaded."""
+    """Return the tuner specification for an isolated process; None if the class cannot load."""
     module = sys.modules.get(kind.__module__)
     if getattr(module, kind.__name__, None) is not kind:
         return None

@@ -312,7 +312,7 @@ def run_digests(
 
 
 def check_same_run_in_other_processes(kind: type[Tuner]) -> None:
-    """Check that runs are the same here, in another process, and in 1 and 4 workers, bit for bit."""
+    """Check that runs agree bit for bit here, in another process, and in 1 and 4 workers."""
     look = f"{kind.__name__}: what depends on the process, e.g. hash(), the clock, threads"
     seeds = (0, 1, 2, 3)
     here = run_digests(kind, seeds)

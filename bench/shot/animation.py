@@ -29,7 +29,12 @@ _DPI = 70
 
 
 class Film(NamedTuple):
-    """Frames of a drop at the frame rate of the animation, and its track (n, 2) until each, pixels."""
+    """Film of a drop, resampled to the frame rate of the animation.
+
+    Attributes:
+        pictures: frames of the film.
+        tracks: for each frame, the ball centres tracked until then, pixels, (n, 2).
+    """
 
     pictures: list[Image]
     tracks: list[Array]
@@ -69,7 +74,7 @@ def animate(
     kept: Mapping[str, Any],
     trusted: bool = False,
 ) -> Path:
-    """Write figures/shot.gif: the drop, if it was filmed, at normal speed and the shots at half speed.
+    """Write figures/shot.gif: a drop at normal speed, if it was filmed, and shots at half speed.
 
     Args:
         folder: result folder.

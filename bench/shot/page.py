@@ -60,7 +60,7 @@ def shot_page(
 
 
 def _conclusion(lines: pd.DataFrame) -> Iterator[str]:
-    """Yield sentences on the method with the most hits, and on methods with overlapping intervals."""
+    """Yield sentences on the method with the most hits, and on those with overlapping intervals."""
     over = lines[lines["ball"] == ALL].sort_values("rate", ascending=False, kind="stable")
     best = over.iloc[0]
     yield (

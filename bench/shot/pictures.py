@@ -242,7 +242,9 @@ def _box(axis: Axes, values: Array, place: int, colour: str) -> None:
 def examples(
     dealt: Sequence[Deal], kept: Mapping[str, Any], rows: pd.DataFrame
 ) -> list[tuple[Deal, list[str]]]:
-    """Select example shots: a typical one, which the untuned simulator missed if possible, and the worst.
+    """Select example shots: a typical one and the worst one of a tuned method.
+
+    The typical one is a shot that the untuned simulator missed, if there is one.
 
     Args:
         dealt: all shots.

@@ -90,7 +90,7 @@ class BounceShotStudy:
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> BounceShotStudy:
-        """Open an interrupted study in order to run what is missing; see `bench.study.Study.resume`.
+        """Open an interrupted study to run what is missing; see `bench.study.Study.resume`.
 
         Args:
             folder: result folder.
@@ -304,7 +304,7 @@ class _Making:
 def _failed(
     experiment: Experiment, error: BaseException, status: str = "crashed"
 ) -> list[dict[str, Any]]:
-    """Make failed models for a shot whose drop was not recorded, or whose worker died or was too slow.
+    """Make failed models for a shot without a recording, or whose worker died or was too slow.
 
     None of them has a plan.
     """
