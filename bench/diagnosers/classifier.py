@@ -179,8 +179,8 @@ def _image(kind: type[Simulated], recording: Recording) -> tuple[Array, float]:
     """Compute the network's input from a recording.
 
     Returns:
-        Residuals in noises, motion, inputs, and masks of the present channels, (R, F, POINTS); and
-        the RMS of the residuals.
+        Residuals in units of the noise, motion, inputs, and masks of the present channels, (R, F,
+        POINTS); and the RMS of the residuals.
     """
     with closing(World(kind, recording, list(recording.runs), "batch", candidates=())) as world:
         noise = Noise(noise_floor(world, recording).sigma, np.zeros(len(world.channels)))

@@ -66,7 +66,7 @@ def families(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
 _LAST = ("(foreign)", "(clean)")
 """Row labels that follow below those of the effect families."""
 _RIGHT = {"(clean)": ("nothing",), "(foreign)": ("unknown",)}
-"""Correct answers for the rows of clean recordings and foreign causes."""
+"""Correct answers for the rows of clean recordings and unmodelled causes."""
 
 
 def _hidden(rows: pd.DataFrame) -> pd.Series[str]:

@@ -32,8 +32,8 @@ def right(rows: pd.DataFrame) -> pd.Series[bool]:
     """Return whether each answer is correct.
 
     Correct is: no alarm for a clean recording; for hidden effects, all named alone or in sets of at
-    most two, equivalent effects counted once; for a foreign cause, the statement that no effect of
-    the library explains it.
+    most two, equivalent effects counted once; for an unmodelled cause, the statement that no effect
+    of the library explains it.
     """
     by_kind = {
         "clean": ~rows["alarm"].astype(bool),

@@ -167,7 +167,7 @@ def text(tables: Mapping[str, pd.DataFrame], order: Sequence[str]) -> list[str]:
 
     Returns:
         A header line and one line per diagnoser with its false alarms, diagnosed single causes,
-        pairs, foreign causes and median cost.
+        pairs, unmodelled causes and median cost.
     """
     columns = (
         ("false alarms", "false alarms"),

@@ -122,7 +122,7 @@ class Compared:
 
     @cached_property
     def errors(self) -> pd.DataFrame:
-        """Table of errors, one line per range, tuner and number of simulations (schema ``diff``)."""
+        """Table of errors, a line per range, tuner and number of simulations (schema ``diff``)."""
         lines = list(self._lines())
         if not lines:
             return pd.DataFrame()

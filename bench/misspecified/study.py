@@ -86,7 +86,7 @@ class MisspecifiedStudy:
         from bench.runs.runner import prepare, refuse_unreachable
 
         new = begun(experiment, folder, jobs, salt)
-        # Validated before the folder is created: an error of the user leaves nothing behind.
+        # Validated before the folder is created: an error of the user leaves no files.
         prepare(before(new.experiment), new.secret)
         if jobs:
             refuse_unreachable(new.experiment)

@@ -82,7 +82,7 @@ class BounceShotStudy:
                 f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'
             )
         new = begun(experiment, folder, jobs, salt)
-        # Validated before the folder is created: an error of the user leaves nothing behind.
+        # Validated before the folder is created: an error of the user leaves no files.
         check(new.experiment)
         if jobs:
             refuse_unreachable(new.experiment)

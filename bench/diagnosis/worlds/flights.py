@@ -106,8 +106,8 @@ LAWS: dict[str, Callable[..., Acceleration]] = {
         0.0,
         0.0,
         c[0] * inside(x, c[1], c[2]),
-    ),  # foreign: rising air within a region of x
-    "layer": _layer,  # foreign: quadratic drag above a height
+    ),  # unmodelled: rising air within a region of x
+    "layer": _layer,  # unmodelled: quadratic drag above a height
 }
 
 
@@ -175,7 +175,7 @@ def _bounce(world: World, t: float, state: Array) -> tuple[Array, bool]:
     speed, e = -state[5], world.parameters["restitution"]
     if "restitution.speed" in world.effects:
         e = min(e * speed ** world.effects["restitution.speed"][0], 1.0)
-    if "wear" in world.foreign:  # foreign: restitution that decreases with time
+    if "wear" in world.foreign:  # unmodelled: restitution that decreases with time
         e = min(max(e * (1.0 - world.foreign["wear"][0] * t), 0.0), 1.0)
     along = hypot(state[3], state[4])
     lost = world.effects.get("contact.friction", [0.0])[0] * (1 + e) * speed

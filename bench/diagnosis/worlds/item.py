@@ -20,7 +20,8 @@ class Item:
         name: composed of kind, system, requested values and seed.
         system: one of `bench.diagnosis.worlds.questions.SYSTEMS`.
         kind: one of `KINDS`.
-        effects: coefficients of the hidden effects, by name; for a foreign cause, its own numbers.
+        effects: coefficients of the hidden effects, by name; for an unmodelled cause, its own
+            numbers.
         size: RMS of the residual in the runs for fitting after base parameters and initial states
             are refitted, in units of the noise; for two effects, that of each alone.
         noise: white, ar1 or quantised.
@@ -33,9 +34,9 @@ class Item:
         channels: recorded channels.
         seed: seed from which the case was drawn.
         parameters: true base parameters.
-        beyond: RMS residual, in units of the noise, that the best wrong answer leaves: for a
-            foreign cause the best effect of the library, for two effects one of them, for an effect
-            with a simpler form that form.
+        beyond: RMS residual, in units of the noise, that the best wrong answer leaves: for an
+            unmodelled cause the best effect of the library, for two effects one of them, for an
+            effect with a simpler form that form.
         asked: recording conditions that were specified and not drawn.
     """
 

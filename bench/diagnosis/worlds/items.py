@@ -28,8 +28,8 @@ from sims.recording.write import write_recording
 SYSTEMS = ("ball", "pendulum", "slider")
 SMALL = (0.1, 0.2, 0.3, 0.5)  # sizes for the power curve only
 
-# Minimum RMS residual, in units of the noise, if only one of two effects or no foreign cause is in
-# the model.
+# Minimum RMS residual, in units of the noise, if only one of two effects or no unmodelled cause is
+# in the model.
 APART = 1.0
 # Minimum RMS residual, in units of the noise, with the simpler form of an effect; below it, the
 # simpler form is a correct answer.
@@ -244,7 +244,7 @@ def _in_order(effects: dict[str, tuple[float, ...]]) -> dict[str, tuple[float, .
 def _foreign(
     item: Item, setting: Setting, hidden: tuple[str, ...], wanted: float, rng: np.random.Generator
 ) -> Item | None:
-    """Hide a foreign cause, which the library explains only in part."""
+    """Hide an unmodelled cause, which the library explains only in part."""
     (name,) = hidden
     of = shapes.foreign(name, setting, rng)
 

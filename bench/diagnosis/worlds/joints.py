@@ -1,4 +1,4 @@
-"""Reference simulation of pendulum and slider with scipy, with any effect or foreign cause.
+"""Reference simulation of pendulum and slider with scipy, with any effect or unmodelled cause.
 
 The model has one coordinate, and events where dry friction stops it. Hidden-state effects add a
 driven mass or an internal state that no sensor shows.
@@ -165,7 +165,7 @@ STEPWISE: dict[str, Callable[..., Array]] = {
 
 
 class Joint:
-    """Equation of motion of one coordinate with effects and foreign causes.
+    """Equation of motion of one coordinate with effects and unmodelled causes.
 
     Attributes:
         inertia: generalised inertia of the drive side.
@@ -400,11 +400,11 @@ FORCES: dict[str, Callable[[Joint, list[float]], Law]] = {
     "force.bias": lambda j, c: lambda t, x, v: c[0],
     "force.ripple": lambda j, c: lambda t, x, v: _wave(c, x / c[2]),
     "force.periodic": lambda j, c: lambda t, x, v: _wave(c, t * c[2]),
-    "ageing": lambda j, c: lambda t, x, v: -c[0] * t * v,  # foreign: damping that grows with time
+    "ageing": lambda j, c: lambda t, x, v: -c[0] * t * v,  # unmodelled: damping grows with time
     "state.limit": lambda j, c: lambda t, x, v: -copysign(1.0, c[0]) * stopped(x, v, *c),
     "latch": lambda j, c: (
         lambda t, x, v: -c[0] * max(x - c[1], 0.0) if j.latched else 0.0
-    ),  # foreign: a soft end stop in every other run
+    ),  # unmodelled: a soft end stop in every other run
 }
 LIMITS: dict[str, Callable[[Joint, list[float]], Law]] = {
     "friction.coulomb": lambda j, c: lambda t, x, v: c[0],
@@ -425,7 +425,7 @@ LIMITS: dict[str, Callable[[Joint, list[float]], Law]] = {
     "friction.warming": lambda j, c: lambda t, x, v: (c[0] + c[1] * abs(v)) * exp(-t / c[2]),
     "patch": lambda j, c: (
         lambda t, x, v: c[0] * inside(x, c[1], c[2])
-    ),  # foreign: dry friction from c1 - c2 to c1 + c2
+    ),  # unmodelled: dry friction from c1 - c2 to c1 + c2
 }
 FOREIGN = ("patch", "gust", "ageing", "latch")
 

@@ -115,7 +115,7 @@ class Setting:
 
         Args:
             effects: hidden effects of the library.
-            foreign: hidden foreign causes.
+            foreign: hidden unmodelled causes.
         """
         return World(self.system, self.parameters, self.constants, effects or {}, foreign or {})
 

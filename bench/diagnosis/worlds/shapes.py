@@ -220,7 +220,7 @@ def _speeds(setting: Setting) -> Array:
 
 
 def foreign(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
-    """Draw the shape of a foreign cause; see `bench.diagnosis.worlds.world`.
+    """Draw the shape of an unmodelled cause; see `bench.diagnosis.worlds.world`.
 
     Args:
         name: name of the cause.

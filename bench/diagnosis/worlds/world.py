@@ -1,8 +1,8 @@
-"""Noise-free reference recordings of ball, pendulum or slider with any effect or a foreign cause.
+"""Noise-free reference recordings of ball, pendulum or slider, with effects or unmodelled causes.
 
 They are solved with scipy or simulated by MuJoCo, not by the engine that `explain` uses (except
 `simulated` with hidden-state effects). sims/effects/README.md defines the coefficients of the
-effects. The foreign causes, which the library does not contain, are:
+effects. The unmodelled causes, which the library does not contain, are:
 
 | cause | numbers | meaning |
 |---|---|---|
@@ -108,7 +108,7 @@ def solved(world: World, scenario: Scenario, channels: Sequence[str], number: in
 
 
 def simulated(world: World, scenario: Scenario, channels: Sequence[str]) -> Array:
-    """Simulate a run with MuJoCo, without foreign causes, and return noise-free sensor readings.
+    """Simulate a run with MuJoCo, without unmodelled causes, and return noise-free sensor readings.
 
     Hidden-state effects move more than one coordinate, so they are simulated by the batch engine,
     with a step of 2.5 ms.

@@ -71,7 +71,7 @@ _FAR = {
 
 
 def places(system: str, effect: str) -> tuple[str, ...]:
-    """List the places of an effect or foreign cause, as ``effect@place`` or ``effect`` alone.
+    """List the places of an effect or unmodelled cause, as ``effect@place`` or ``effect`` alone.
 
     Args:
         system: servo or arm2.
@@ -172,7 +172,7 @@ _SHAPES: dict[str, Callable[..., Shape]] = {
 
 
 def foreign(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
-    """Draw the shape of a foreign cause.
+    """Draw the shape of an unmodelled cause.
 
     Args:
         name: ``cause@joint``, or ``cause`` alone.

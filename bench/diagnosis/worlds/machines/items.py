@@ -27,9 +27,15 @@ from sims.base import Array
 SYSTEMS = tuple(PLANTS)
 """Names of the machines."""
 APART = 1.0
-"""Minimum RMS residual, in noises, with only one of two effects or without a foreign cause."""
+"""Minimum RMS residual that a wrong answer must leave, in units of the noise.
+
+A wrong answer is one of two hidden effects alone, or library effects for an unmodelled cause.
+"""
 TELLING = 0.4
-"""Minimum RMS residual in noises with the simpler form of an effect; below it, that is correct."""
+"""Minimum RMS residual that the simpler form of an effect must leave, in units of the noise.
+
+Below it, the simpler form is a correct answer.
+"""
 SIMPLER = {"friction.stribeck": "friction.coulomb"}
 _NUDGE = 1e-4
 """Finite-difference step: relative for a parameter, rad or rad/s for an initial state."""
@@ -165,7 +171,7 @@ def _double(
 def _foreign(
     item: Item, made: Setting, cause: str | None, wanted: float, rng: np.random.Generator
 ) -> Item | None:
-    """Hide a foreign cause, which the library explains only in part."""
+    """Hide an unmodelled cause, which the library explains only in part."""
     chosen = cause or str(rng.choice(causes.FOREIGN))
     joint = str(rng.choice(PLANTS[item.system].joints))
     name = f"{chosen}@{joint}" if joint else chosen
@@ -186,7 +192,10 @@ def _beyond(
     others: Sequence[str],
     rng: np.random.Generator,
 ) -> float:
-    """Compute the first-order RMS residual, in noises, that the best of other causes leaves."""
+    """Compute the RMS residual that the best of other causes leaves, to first order.
+
+    It is in units of the noise.
+    """
     gauge = _Gauge(made)
     change = made.seen(effects, foreign) - gauge.bare
     bare = made.seen(coarse=_COARSE)
@@ -200,7 +209,7 @@ def _beyond(
 
 
 class _Gauge:
-    """Sizes of changes after parameters and initial states are projected out, in noises.
+    """Sizes of changes, in units of the noise, with parameters and initial states projected out.
 
     Args:
         made: recording conditions; only the runs for fitting are used.

@@ -79,7 +79,7 @@ class Setting:
 
         Args:
             effects: hidden effects of the library.
-            foreign: hidden foreign causes.
+            foreign: hidden unmodelled causes.
         """
         return PLANTS[self.system](self.numbers, effects or {}, foreign or {})
 
@@ -90,7 +90,7 @@ class Setting:
 
         Args:
             effects: hidden effects of the library.
-            foreign: hidden foreign causes.
+            foreign: hidden unmodelled causes.
             coarse: factor of the step size.
 
         Returns:
