@@ -1,7 +1,8 @@
 """Sizing of hidden effects: strength at which an effect leaves a residual of the requested size.
 
 The size is the RMS residual after base parameters and initial states are refitted. The batch engine
-is used here to choose sizes only; the recordings of the benchmark never come from it.
+is used here to choose sizes. Recordings of the benchmark come from other integrators, except for
+hidden-state effects (`bench.diagnosis.worlds.world.simulated`).
 """
 
 from __future__ import annotations
