@@ -1,5 +1,7 @@
-"""`simgap bundle` and what `simgap verify` does of an archive: the folder of a comparison or an
-explanation as one file for a paper's supplement, and whether one made elsewhere is what it says.
+"""Pack a result folder into one archive (`simgap bundle`); verify an archive or an explanation.
+
+The folder is that of a comparison or an explanation; the archive is meant for the supplement of a
+paper. `simgap verify` checks whether an archive made elsewhere is consistent.
 """
 
 from __future__ import annotations
@@ -31,24 +33,25 @@ VERDICT = "verdict.json"
 EXTENDED = "extended.toml"
 _FORMAT = 1
 _BESIDE = "recordings"
-"""The folder of recordings in an explanation's archive."""
+"""Folder of recordings in the archive of an explanation."""
 _PLUGINS = "plugins"
-"""The folder of plugin files in a comparison's."""
+"""Folder of plugin files in the archive of a comparison."""
 _SAME = 1e-3
-"""Share by which a held-out error may differ: initial states are estimated anew, perhaps on another
-machine.
+"""Relative tolerance of a held-out error.
+
+Initial states are estimated again, possibly on another machine.
 """
 
 
 class Bundled(NamedTuple):
-    """An archive that was written.
+    """Result of writing an archive.
 
     Attributes:
-        archive: the file.
+        archive: path of the archive.
         kind: comparison or explanation.
-        files: in it.
-        command: that makes its content again.
-        left_out: files of the folder that are not in it, and why.
+        files: number of files in it.
+        command: command that reproduces its content.
+        left_out: files of the folder that are not in it, with the reason.
     """
 
     archive: Path
@@ -58,21 +61,22 @@ class Bundled(NamedTuple):
     left_out: tuple[str, ...]
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Convert to a JSON document."""
         size = self.archive.stat().st_size
         return {**self._asdict(), "bytes": size, "sha256": sha256(self.archive)}
 
 
 def bundle(folder: Path, out: Path | None = None, recordings: Sequence[Path] = ()) -> Bundled:
-    """Write a folder as one archive.
+    """Write a result folder as one archive.
 
     Args:
-        folder: of a finished comparison, a sweep or an explanation.
-        out: the file to write, a new one; NAME.zip here where None.
-        recordings: of an explanation, tables that go with it, each with its description.
+        folder: folder of a finished comparison, a sweep or an explanation.
+        out: path of the new archive; None for NAME.zip in the current folder.
+        recordings: CSV files of the recordings to add to an explanation, with their descriptions.
 
     Raises:
-        InputError: it is no such folder, not finished, or the file is there already.
+        InputError: the folder is not a result folder or not finished, or the archive exists
+            already.
     """
     kind = _kind(folder)
     name = folder.resolve().name
@@ -109,7 +113,7 @@ def _kind(folder: Path) -> str:
 
 
 def _files(folder: Path) -> tuple[dict[str, Path], list[str]]:
-    """The files of a folder by their paths in it, and what is left out."""
+    """List the files of a folder by their relative paths, and those that are left out."""
     found, left_out = {}, []
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -123,7 +127,7 @@ def _files(folder: Path) -> tuple[dict[str, Path], list[str]]:
 
 
 def _of_plugins(folder: Path) -> dict[str, Path]:
-    """The plugin files that a comparison needs: who looks at it may read them before they run."""
+    """List the plugin files of a comparison, so that they can be inspected before they run."""
     plugins = [Path(file) for part in parts_of(folder) for file in configuration(part).plugins]
     there = [file for file in dict.fromkeys(plugins) if file.is_file()]
     return {f"{_PLUGINS}/{file.name}": file for file in there}
@@ -141,7 +145,7 @@ def _of_recordings(tables: Sequence[Path]) -> dict[str, Path]:
 
 
 def _explaining(folder: Path) -> str:
-    """The command that makes an explanation again, as far as its folder knows."""
+    """Build the command that reproduces an explanation, as far as its folder states it."""
     made = environment(folder)
     tables = [each["file"] for each in made.get("recordings", []) if each["file"][-5:] != ".toml"]
     words = explaining(tables or ["RECORDING.csv"], made.get("settings", {}))
@@ -149,12 +153,12 @@ def _explaining(folder: Path) -> str:
 
 
 class Checked(NamedTuple):
-    """What came of looking at an explanation.
+    """Result of verifying an explanation.
 
     Attributes:
-        checked: what was looked at, in words.
-        unchecked: what could not be, and why.
-        doubts: what does not follow.
+        checked: descriptions of what was checked.
+        unchecked: what could not be checked, with the reason.
+        doubts: verification failures.
     """
 
     checked: list[str]
@@ -162,19 +166,19 @@ class Checked(NamedTuple):
     doubts: list[Doubt]
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Convert to a JSON document."""
         doubts = [doubt._asdict() for doubt in self.doubts]
         return {**self._asdict(), "follows": not self.doubts, "doubts": doubts}
 
 
 class Archived(NamedTuple):
-    """What came of looking at an archive.
+    """Result of verifying an archive.
 
     Attributes:
-        archive: what it says of itself, with what was counted.
-        doubts: files that are not as its manifest says; then nothing else was looked at.
-        comparisons: each that is in it.
-        explanation: the one that is in it.
+        archive: metadata of the archive.
+        doubts: files that differ from the manifest; if there are any, nothing else is verified.
+        comparisons: result for each comparison in it.
+        explanation: result for the explanation in it.
     """
 
     archive: dict[str, Any]
@@ -184,12 +188,12 @@ class Archived(NamedTuple):
 
     @property
     def follows(self) -> bool:
-        """Whether all of it does."""
+        """Whether there is no verification failure."""
         sound = not self.doubts and all(each.follows for each in self.comparisons)
         return sound and not (self.explanation and self.explanation.doubts)
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Convert to a JSON document."""
         compared = [each.document() for each in self.comparisons]
         told = self.explanation.document() if self.explanation else None
         archive = {**self.archive, "doubts": [doubt._asdict() for doubt in self.doubts]}
@@ -200,16 +204,16 @@ class Archived(NamedTuple):
 def verify_archive(
     archive: Path, say: Say, plugins: Sequence[str] = (), every: bool = False
 ) -> Archived:
-    """See whether an archive is what it says, and what is in it tells the truth.
+    """Verify that an archive matches its manifest, and verify the results in it.
 
     Args:
-        archive: of `bundle`, made elsewhere.
+        archive: archive written by `bundle`, possibly elsewhere.
         say: prints a line.
-        plugins: plugin files; those that the archive names or holds are never run.
-        every: whether every simulation is made again, and not a share.
+        plugins: plugin files to load; those that the archive names or contains are never run.
+        every: whether to repeat every simulation instead of a sample.
 
     Raises:
-        InputError: it is none, or nothing that anybody should unpack.
+        InputError: the file is not such an archive, or is unsafe to unpack.
     """
     with unpacked(archive) as found:
         about = _about(archive, found)
@@ -253,8 +257,13 @@ def _told(doubts: Sequence[Doubt], where: Path, say: Say) -> None:
 
 
 def verify_explanation(folder: Path, say: Say) -> Checked:
-    """See what can be seen of an explanation: that its parts are sound and say the same, and that
-    its held-out error comes out again where the recording lies in it.
+    """Verify that the files of an explanation are valid and consistent.
+
+    If the folder contains the recording, the held-out error is computed again.
+
+    Args:
+        folder: folder of the explanation.
+        say: prints a line.
     """
     found = _explained(folder, say)
     _told(found.doubts, folder, say)
@@ -276,7 +285,7 @@ def _explained(folder: Path, say: Say) -> Checked:
         extended, _, _ = opened(folder / EXTENDED, simulators.get)
     except InputError as error:
         text = str(error).replace(f"{folder}/", "")
-        # What a robot's file was is known by its hash; that it is not here is no doubt.
+        # The hash of a robot's model file is known; its absence here is no verification failure.
         if "model" in text and "no such file" in text:
             found.unchecked.append(f"{EXTENDED}: {text}")
             say(f"not checked: {found.unchecked[-1]}")
@@ -308,7 +317,7 @@ def _verdict(folder: Path, found: Checked) -> Verdict | None:
 
 
 def _unlike(verdict: Verdict, extended: Extended) -> Iterator[Doubt]:
-    """Numbers of the verdict that the extended simulator does not have, or has otherwise."""
+    """Yield numbers of the verdict that are missing or different in the extended simulator."""
     for name, number in verdict.parameters.items():
         other = extended.parameters.get(name)
         if other is not None and not math.isclose(number.value, other.value, rel_tol=1e-9):
@@ -323,7 +332,7 @@ def _unlike(verdict: Verdict, extended: Extended) -> Iterator[Doubt]:
 
 
 def _scored(folder: Path, verdict: Verdict, found: Checked, note: Say) -> None:
-    """Score the extended simulator on the recording, where it lies in the folder."""
+    """Repeat the held-out error of the extended simulator, if the folder has the recording."""
     made = environment(folder)
     stated = verdict.heldout.rmse_extended if verdict.heldout else None
     tables = sorted((folder / _BESIDE).glob("*.csv"))

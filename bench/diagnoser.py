@@ -1,4 +1,4 @@
-"""The contract of diagnosers: a recording in, a verdict out.
+"""Interface of diagnosers: a recording in, a verdict with named causes out.
 
 A diagnoser says what a simulation gets wrong on a recording. It is a class with a name and one
 method::
@@ -10,9 +10,9 @@ method::
             ...
             return "adequate"
 
-It gets what a user has (`Case`): the recording, the simulator, the library of effects, the noise
-where it is stated, runs that are held out. It never gets the truth, nor anything that leads to it.
-It answers with an `Answer`, with a word of `VERDICTS`, or with a dictionary as verdict.json has it.
+Its input is what a user has (`Case`): the recording, the simulator, the library of effects, the
+noise if it is stated, and held-out runs. It never gets the truth, nor anything from which the truth
+follows. It returns an `Answer`, a word of `VERDICTS`, or a dictionary like verdict.json.
 """
 
 from __future__ import annotations
@@ -35,20 +35,21 @@ from sims.system import Effect
 from sims.tally import TALLY
 
 VERDICTS = ("adequate", "named", "ambiguous", "partial", "unknown", "unidentifiable")
-"""What may be concluded; see docs/verdict.md."""
+"""Possible verdicts; see docs/verdict.md."""
 _MOST_CAUSES = 20
 _MOST_ALTERNATIVES = 200
 
 
 @dataclass(frozen=True)
 class Named:
-    """A cause that a diagnoser names.
+    """Cause that a diagnoser names.
 
     Attributes:
-        effect: its name in the library.
-        alternatives: effects that would explain the same as well.
-        coefficients: by name (lowest, highest) of a 95 % interval, an end None where it is open.
-        p_value: chance of such evidence if it were not there; None where the method gives none.
+        effect: name of the effect in the library.
+        alternatives: effects that would explain the recording as well.
+        coefficients: 95 % intervals (low, high) by name; an end is None if it is open.
+        p_value: p-value under the hypothesis that the effect is absent; None if the method gives
+            none.
     """
 
     effect: str
@@ -57,7 +58,7 @@ class Named:
     p_value: float | None = None
 
     def document(self) -> dict[str, Any]:
-        """As in verdict.json."""
+        """Convert to a JSON document like verdict.json."""
         return {
             "effect": self.effect,
             "alternatives": list(self.alternatives),
@@ -68,14 +69,14 @@ class Named:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a diagnoser concludes.
+    """Conclusion of a diagnoser.
 
     Attributes:
         verdict: one of `VERDICTS`.
-        causes: what is missing, each a set of one effect or of several that the data cannot tell
-            apart.
-        parameters: 95 % intervals of the system's own parameters, as those of coefficients.
-        p_value: chance of evidence like this if nothing were missing; None where the method gives
+        causes: missing effects; each is one effect, or a set of effects that the data cannot
+            distinguish.
+        parameters: 95 % intervals (low, high) of the system's own parameters, by name.
+        p_value: p-value under the hypothesis that nothing is missing; None if the method gives
             none.
     """
 
@@ -86,10 +87,10 @@ class Answer:
 
     @classmethod
     def of(cls, given: object) -> Answer:
-        """An answer from what a diagnoser returned.
+        """Convert what a diagnoser returned into an answer.
 
         Raises:
-            InputError: it is none.
+            InputError: it is not a valid answer.
         """
         if isinstance(given, Answer):
             return cls.of(given.document())
@@ -106,7 +107,7 @@ class Answer:
         return cls(str(verdict), tuple(_named(cause) for cause in causes), parameters, p)
 
     def document(self) -> dict[str, Any]:
-        """As in verdict.json, as far as a diagnoser says it."""
+        """Convert to a JSON document with the keys of verdict.json that a diagnoser provides."""
         return {
             "verdict": self.verdict,
             "causes": [cause.document() for cause in self.causes],
@@ -117,18 +118,20 @@ class Answer:
 
 @dataclass(frozen=True)
 class Case:
-    """What a diagnoser gets.
+    """Input of a diagnoser.
 
     Attributes:
-        path: the recording's table, with its description beside it, in a folder of the diagnoser's
-            own that it may write to.
-        recording: the same, read: runs for fitting and runs held out, constants, stated noise.
-        kind: the simulator's class; every simulation that it makes is counted.
-        library: the effects that may be missing, by name: those whose signals are recorded.
-        rng: the only source of chance.
-        budget: simulations that may be made.
-        seconds: that it may take.
-        learned: arrays by name that its `train` has learned.
+        path: CSV file of the recording; its description is in the same folder, which the diagnoser
+            may write to.
+        recording: the recording as an object: runs for fitting and held-out runs, constants, stated
+            noise.
+        kind: class of the simulator; all its simulations are counted.
+        library: effects that may be missing, by name: those whose signals are recorded.
+        rng: the only source of random numbers.
+        budget: maximum number of simulations.
+        seconds: maximum time.
+        learned: trained arrays by name, from the method `train`.
+        begun: start of the diagnosis, on the clock of `time.perf_counter`.
     """
 
     path: Path
@@ -143,12 +146,12 @@ class Case:
 
     @property
     def used(self) -> int:
-        """Simulations made so far."""
+        """Number of simulations made so far."""
         return TALLY.used
 
     @property
     def left(self) -> float:
-        """Seconds that are left."""
+        """Remaining time in seconds."""
         return self.begun + self.seconds - perf_counter()
 
     def simulate(
@@ -158,13 +161,17 @@ class Case:
         effects: Mapping[str, Sequence[float]] | None = None,
         initial: Mapping[str, float] | None = None,
     ) -> dict[str, Array]:
-        """Channels (T,) by name of one run, simulated.
+        """Simulate one run.
 
         Args:
-            run: says when, under which inputs, from where.
-            parameters: of the system; nominal where not given.
+            run: its times, inputs and initial states are used.
+            parameters: parameters of the system by name; nominal values for the others.
             effects: coefficients by name of the effects that act.
-            initial: initial states; the system's defaults where neither this nor the run says.
+            initial: initial states; if neither this nor the run has one, the default of the system
+                is used.
+
+        Returns:
+            Recorded channels (T,) by name.
         """
         recorded = [c.name for c in self.kind.channels if c.name in run.channels]
         fixed = {name: list(c) for name, c in (effects or {}).items()}
@@ -184,13 +191,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Lesson:
-    """What a diagnoser learns from: a system, and simulations of its own making.
+    """Training task of a diagnoser: a system and a budget of simulations.
 
     Attributes:
-        kind: the simulator's class.
-        library: the effects that may be missing.
-        rng: the only source of chance.
-        budget: simulations that may be made; they are counted, and shown apart.
+        kind: class of the simulator.
+        library: effects that may be missing.
+        rng: the only source of random numbers.
+        budget: maximum number of simulations; they are counted and reported separately.
     """
 
     kind: type[Simulated]
@@ -200,13 +207,13 @@ class Lesson:
 
 
 class Diagnoser(ABC):
-    """Says what a simulation gets wrong on a recording.
+    """Base class of diagnosers, which say what a simulation gets wrong on a recording.
 
     Attributes:
-        name: under which it is registered.
-        learned: whether `train` is to be called before.
-        requires: packages that it needs beside simgap's own.
-        known_failures: checks of its conformance suite that fail on purpose, each with the reason.
+        name: registered name.
+        learned: whether `train` must be called before `diagnose`.
+        requires: packages that it needs in addition to those of simgap.
+        known_failures: conformance checks that fail on purpose, each with the reason.
     """
 
     name: ClassVar[str]
@@ -216,30 +223,39 @@ class Diagnoser(ABC):
 
     @abstractmethod
     def diagnose(self, case: Case) -> Answer | str | Mapping[str, Any]:
-        """What is missing from the simulation of this recording."""
+        """Diagnose what is missing in the simulation of a recording."""
 
     def cannot(self, kind: type[Simulated]) -> str:  # noqa: ARG002
-        """Why it cannot be asked about recordings of a simulator at all; empty where it can.
+        """Return why recordings of a simulator are not supported; empty if they are.
 
-        It then counts as skipped there, and not as failed. It sees no recording: nobody chooses his
-        questions.
+        Such cases count as skipped and not as failed. The method does not see any recording, so
+        that no diagnoser can select its cases.
         """
         return ""
 
     def train(self, lesson: Lesson) -> Mapping[str, Array]:  # noqa: ARG002
-        """Learn once for a system, before any recording is seen; what is learned, as arrays."""
+        """Train once for a system, before any recording is available.
+
+        Returns:
+            Trained arrays by name; they are passed on in `Case.learned`.
+        """
         return {}
 
 
 def library_of(kind: type[Simulated], recording: Recording) -> dict[str, type[Effect]]:
-    """The effects that a recording of a system could show, by name."""
+    """Return the effects whose signals are recorded, by name.
+
+    Args:
+        kind: class of the simulator.
+        recording: the recording.
+    """
     signals = {*recording.runs[0].channels, *(channel.name for channel in kind.inputs)}
     usable = effects_library.library(kind.system)
     return {n: e for n, e in usable.items() if not e.signal or e.signal in signals}
 
 
 def names_in(answer: Answer) -> list[tuple[str, ...]]:
-    """The sets of effects that an answer names."""
+    """List the sets of effects that an answer names."""
     return [(cause.effect, *cause.alternatives) for cause in answer.causes]
 
 

@@ -1,6 +1,7 @@
-"""Sees whether a finished comparison tells the truth: its targets follow from the salt that was
-committed before the first run, its errors from its targets, its losses from its proposals,
-and its tables from its rows.
+"""Verify that a finished comparison is consistent.
+
+Its targets must follow from the salt that was committed before the first run, its errors from its
+targets, its losses from its proposals, and its tables from its rows.
 """
 
 from __future__ import annotations
@@ -25,20 +26,20 @@ from sims.base import Array, InputError
 
 Say = Callable[[str], None]
 ROWS = 2000
-"""Simulations that are made again where not all are asked for."""
+"""Maximum number of simulations that are repeated, unless all are requested."""
 _SAME = 1e-9
-"""Share by which a number may differ that arithmetic alone gives."""
+"""Relative tolerance of numbers that arithmetic alone determines."""
 _SIMULATED = 1e-6
-"""Share by which one may differ that a simulator gives, on another machine perhaps."""
+"""Relative tolerance of simulated numbers, possibly from another machine."""
 
 
 class Doubt(NamedTuple):
-    """What does not follow.
+    """Verification failure: a file or row that does not follow from the others.
 
     Attributes:
-        file: in the folder.
-        row: of it, from 1; 0 for the whole file.
-        says: what was expected, and what was found.
+        file: path in the folder.
+        row: number of the row from 1; 0 for the whole file.
+        says: what was expected and what was found.
     """
 
     file: str
@@ -50,12 +51,12 @@ class Doubt(NamedTuple):
 
 
 class Verified(NamedTuple):
-    """What came of looking whether a comparison tells the truth.
+    """Result of verifying a comparison.
 
     Attributes:
-        folder: the comparison's.
-        checked: what was looked at, in words.
-        doubts: what does not follow.
+        folder: folder of the comparison.
+        checked: descriptions of what was checked.
+        doubts: verification failures.
     """
 
     folder: Path
@@ -64,11 +65,11 @@ class Verified(NamedTuple):
 
     @property
     def follows(self) -> bool:
-        """Whether all of it does."""
+        """Whether there is no verification failure."""
         return not self.doubts
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Convert to a JSON document."""
         doubts = [doubt._asdict() for doubt in self.doubts]
         return {
             "folder": self.folder,
@@ -86,17 +87,18 @@ def verify(
     every: bool = False,
     own_plugins: bool = True,
 ) -> Verified:
-    """See whether a finished comparison tells the truth, and say so.
+    """Verify a finished comparison, and print the result.
 
     Args:
-        folder: the comparison's.
+        folder: folder of the comparison.
         say: prints a line.
-        plugins: plugin files beside those that it names.
-        every: whether every simulation is made again, and not a share.
-        own_plugins: whether the plugin files that it names are run; not those of a stranger's.
+        plugins: plugin files in addition to those that the comparison names.
+        every: whether to repeat every simulation instead of a sample.
+        own_plugins: whether to run the plugin files that the comparison names; False for a
+            comparison from an untrusted source.
 
     Raises:
-        InputError: it is not finished, or damaged.
+        InputError: the comparison is not finished, or it is damaged.
     """
     held = configuration(folder)
     experiment = held.experiment
@@ -113,7 +115,7 @@ def verify(
         checks.append(line)
         say(line)
 
-    # A fault in experiment.toml's salt has been refused by who read it.
+    # The salt in experiment.toml was already checked against its hash when the file was read.
     stored = checked(folder)
     note(_salt(experiment))
     named = held.plugins if own_plugins else []
@@ -144,7 +146,7 @@ def _salt(experiment: Experiment) -> str:
 
 
 def _rows(stored: Stored, problem: Problem, say: Say, every: bool) -> list[Doubt]:
-    """What does not follow in runs.parquet."""
+    """Verify runs.parquet, and return the failures."""
     targets = {target.sealed.name: target for target in problem.targets()}
     runs = stored.runs
     doubts = [
@@ -169,7 +171,7 @@ def _rows(stored: Stored, problem: Problem, say: Say, every: bool) -> list[Doubt
 
 
 def _errors(problem: Problem, target: Target, rows: pd.DataFrame) -> Iterator[Doubt]:
-    """What does not follow from a target's truth in its rows."""
+    """Yield rows of a target whose errors do not follow from its truth."""
     if target.truth is None:
         return
     names = [parameter.name for parameter in problem.cube.parameters]
@@ -181,13 +183,13 @@ def _errors(problem: Problem, target: Target, rows: pd.DataFrame) -> Iterator[Do
     if len(names) == 1:
         expected["param_abs_error"] = errors[:, 0]
     for column, values in expected.items():
-        # Rounding of parameters far larger than their error is no fault.
+        # Rounding of parameters that are far larger than their error is not a failure.
         slack = 1e-12 * float(np.abs(target.truth).max())
         yield from _unlike(rows, column, values, _SAME, slack)
 
 
 def _losses(problem: Problem, target: Target, rows: pd.DataFrame) -> Iterator[Doubt]:
-    """What a simulation that is made again does not give."""
+    """Yield rows of a target whose losses and errors differ from repeated simulations."""
     names = [parameter.name for parameter in problem.cube.parameters]
     channel = problem.error_channel
     made = rows[rows["k"] > 0]
@@ -201,7 +203,7 @@ def _losses(problem: Problem, target: Target, rows: pd.DataFrame) -> Iterator[Do
         ("obs_error", target.sealed.fitting),
         ("heldout_error", target.sealed.held_out),
     ):
-        # Who ended before it had delivered anything has no error.
+        # A run that ended before its first result has no error.
         there = rows[column].notna().to_numpy()
         if side.scenarios and there.any():
             rmse = Evaluator(problem, side).rmse(recommended[:0], recommended[there])
@@ -210,7 +212,7 @@ def _losses(problem: Problem, target: Target, rows: pd.DataFrame) -> Iterator[Do
 
 
 def _points(problem: Problem, frame: pd.DataFrame) -> Array:
-    """Rows of parameters as points of the unit cube, from which rounding may have moved them."""
+    """Convert parameters to points of the unit cube, clipped because of rounding."""
     points: Array = np.clip(problem.cube.inverse(frame.to_numpy(dtype=float)), 0.0, 1.0)
     return points
 
@@ -218,7 +220,7 @@ def _points(problem: Problem, frame: pd.DataFrame) -> Array:
 def _unlike(
     rows: pd.DataFrame, column: str, expected: Array, share: float, slack: float
 ) -> Iterator[Doubt]:
-    """The first row in which a column is not what it should be."""
+    """Yield the first row in which a column differs from the expected values."""
     if column not in rows:
         return
     found = rows[column].to_numpy(dtype=float)
@@ -232,13 +234,13 @@ def _unlike(
 
 
 def _chosen(runs: pd.DataFrame, most: int) -> pd.DataFrame:
-    """So many rows, evenly over all of them."""
+    """Select at most `most` rows, evenly spaced."""
     places = np.unique(np.linspace(0, len(runs) - 1, min(most, len(runs))).round().astype(int))
     return runs.iloc[places]
 
 
 def _tables(folder: Path, stored: Stored, say: Say) -> list[Doubt]:
-    """What does not follow from the rows in table.csv."""
+    """Verify that table.csv follows from the rows, and return the failures."""
     path = folder / "table.csv"
     if not path.exists():
         say("table.csv: none; simgap plot writes it")
@@ -248,7 +250,7 @@ def _tables(folder: Path, stored: Stored, say: Say) -> list[Doubt]:
     if len(found) != len(expected):
         return [Doubt(path.name, 0, f"expected {len(expected)} rows, found {len(found)}")]
     doubts = []
-    # The order of rows says nothing: it follows the ranking of the version that wrote them.
+    # The order of the rows is ignored: it depends on the version that wrote them.
     keys = ["experiment", "tuner", "range", "simulations", "metric"]
     if not set(keys) - set(found):
         expected = expected.sort_values(keys, kind="stable")

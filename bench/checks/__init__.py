@@ -1,9 +1,9 @@
-"""Conformance suites for tuners, simulators, effects and diagnosers: to register is to be tested.
+"""Conformance suites for tuners, simulators, effects and diagnosers.
 
-Each check is a function that raises `CheckError` when its subject does not conform, saying what was
-expected, what was found and where to look; it returns `NotApplicable` where there was nothing to
-check. The suites run over everything registered in this project's tests; authors of plugins use
-`parametrize(MyTuner)` in their own tests, or ``simgap check NAME``.
+Each check is a function that raises `CheckError` if its subject does not conform; the message says
+what was expected, what was found and where to look. A check returns `NotApplicable` if there was
+nothing to check. The tests of this project run the suites on everything that is registered. Authors
+of plugins use `parametrize(MyTuner)` in their own tests, or ``simgap check NAME``.
 """
 
 from bench.checks.base import CheckError, NotApplicable

@@ -1,5 +1,7 @@
-"""The robot that effects at places are checked on: a finger of two joints that a servo and a motor
-drive, with something stated of everything that an effect may change.
+"""Robot arm on which effects at places are checked.
+
+It has two joints, driven by a servo and a motor. Every quantity that an effect may change is stated
+in its model file.
 """
 
 from __future__ import annotations
@@ -43,17 +45,20 @@ TEXT = """
   </sensor>
 </mujoco>
 """
-"""Its model file. Nothing in it is alike, so that a swap of two places shows."""
+"""Model file of the arm. All values differ, so that confusing two places is detected."""
 
 OBSERVED = ("q.shoulder", "q.elbow", "qd.shoulder", "tau.elbow", "s.wrist.y")
-"""Channels of each kind."""
+"""Observed channels, one of each kind."""
 
 _SECONDS = 0.8
 
 
 @lru_cache(maxsize=1)
 def arm(effect: type[Effect]) -> type[RobotSimulator]:  # noqa: ARG001
-    """The simulator of the arm; made anew for each effect, whose places it remembers by name."""
+    """Make the simulator of the arm.
+
+    It is made anew for each effect, because it caches the places of effects by name.
+    """
     import mujoco
 
     from sims.robot.model import Robot
@@ -64,8 +69,9 @@ def arm(effect: type[Effect]) -> type[RobotSimulator]:  # noqa: ARG001
 
 
 def placed(effect: type[Effect]) -> tuple[type[Effect], ...]:
-    """The effect at all places of the arm where it can act, and its family; empty where MuJoCo is
-    not installed.
+    """Return an effect at all places of the arm where it can act, and its family.
+
+    The result is empty if MuJoCo is not installed.
     """
     from importlib.util import find_spec
 
@@ -77,8 +83,8 @@ def placed(effect: type[Effect]) -> tuple[type[Effect], ...]:
 
 
 def scenario() -> Scenario:
-    """A run in which both joints turn round and every command changes."""
-    # The first samples lie at the ends of steps, the others between them.
+    """Make a run in which both joints reverse and every command changes."""
+    # The first samples are at the ends of simulation steps, the others between them.
     times = np.concatenate([np.arange(0.0, 0.3, 0.02), np.arange(0.301, _SECONDS, 0.021)])
     initial = {"q.shoulder": 0.4, "q.elbow": -0.7, "qd.shoulder": -1.0, "qd.elbow": 2.0}
     first = np.where(times % 0.4 < 0.2, 0.6, -0.3)

@@ -1,4 +1,4 @@
-"""What all conformance checks share."""
+"""Shared parts of all conformance checks."""
 
 from __future__ import annotations
 
@@ -14,47 +14,61 @@ from sims.base import Array
 
 
 class CheckError(AssertionError):
-    """A subject does not conform; the message says what was expected, what was found, and where to
-    look.
+    """Error of a subject that does not conform.
+
+    The message says what was expected, what was found, and where to look.
     """
 
 
 class NotApplicable(NamedTuple):
-    """What a check returns that found nothing to check; it has neither passed nor failed.
+    """Result of a check that found nothing to check; it has neither passed nor failed.
 
     Attributes:
-        reason: why it does not apply to the subject.
+        reason: why the check does not apply to the subject.
     """
 
     reason: str
 
 
 Check = Callable[[Any], NotApplicable | None]
-"""Raises `CheckError` where its subject does not conform."""
+"""Function that raises `CheckError` if its subject does not conform."""
 
 
 def require(condition: bool, expected: str, found: object, look: str) -> None:
-    """Raise `CheckError` unless `condition` holds."""
+    """Raise `CheckError` unless a condition holds.
+
+    Args:
+        condition: the condition.
+        expected: what was expected.
+        found: what was found.
+        look: where the author of the subject should look.
+    """
     if not condition:
         raise CheckError(f"expected {expected}; found {found}; see {look}")
 
 
 def same_bits(a: Array, b: Array) -> bool:
-    """Whether two arrays agree in shape and in every bit, NaN included."""
+    """Return whether two arrays have the same shape and the same bits, NaN included."""
     return a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
 @contextmanager
 def global_random_state_untouched(look: str) -> Iterator[None]:
-    """Raise `CheckError` if the block draws from, or seeds, the generators of `random`, numpy or
-    (if loaded) torch.
+    """Check that a block does not use the global random generators.
 
-    They are put into a state of their own first, so that seeding with a usual number shows, and
-    back afterwards.
+    The generators are those of `random`, NumPy and, if it is loaded, torch. Before the block, the
+    first two are set to unusual seeds, so that seeding with a common number is detected; afterwards
+    they are restored.
+
+    Args:
+        look: where the author of the subject should look.
+
+    Raises:
+        CheckError: the block draws from a global generator or seeds it.
     """
     python = random.getstate()
     legacy = np.random.get_state()  # noqa: NPY002 - it is what must not change
-    # A method that seeds with 0 or 42 would leave these unchanged only by coming upon two primes.
+    # Large primes as seeds: a method that seeds with 0 or 42 certainly changes the state.
     random.seed(82_589_933)
     np.random.seed(30_402_457)  # noqa: NPY002
     before = _random_states()

@@ -1,8 +1,7 @@
-"""What `simgap check NAME` does: the conformance suite on a tuner, a simulator, an effect or a
-diagnoser, each check in a worker process.
+"""Run the conformance suite of one subject (`simgap check NAME`), each check in a worker process.
 
-A check is not made where another one has failed without which it means nothing: one cause gives one
-failure.
+The subject is a tuner, a simulator, an effect or a diagnoser. A check is not run if another check
+that it needs has failed, so that one cause gives one failure.
 """
 
 from __future__ import annotations
@@ -24,24 +23,24 @@ from sims.base import InputError, unknown
 _HERE = (check_same_run_in_other_processes,)
 """Checks that start worker processes themselves."""
 _KNOWN = "known: "
-"""Begins the line of a check that fails on purpose."""
+"""Prefix of the line of a check that fails on purpose."""
 _IDLE = "not applicable: "
-"""Begins the line of a check that found nothing to check."""
+"""Prefix of the line of a check that does not apply to the subject."""
 _LEFT_OUT = "not tested: "
-"""Begins the line of a check that was not made."""
+"""Prefix of the line of a check that was not run."""
 _MARKS = {_KNOWN: "known ", _IDLE: "-     ", _LEFT_OUT: "-     "}
 _OUTCOMES = {_KNOWN: "known", _IDLE: "not applicable", _LEFT_OUT: "not tested"}
-"""What a line's beginning means, for programs."""
+"""Outcome for programs, by the prefix of a line."""
 
 
 class Checked(NamedTuple):
-    """What the conformance suite has found.
+    """Result of a conformance suite.
 
     Attributes:
-        name: of the subject.
-        kind: tuner, simulator or effect.
-        qualified: its class.
-        lines: of each check by its title: what was found, nothing where all is well.
+        name: name of the subject.
+        kind: tuner, simulator, effect or diagnoser.
+        qualified: qualified name of its class.
+        lines: line of each check by its title; empty if the check passed.
     """
 
     name: str
@@ -55,7 +54,7 @@ class Checked(NamedTuple):
         return all(_outcome(line) != "failed" for line in self.lines.values())
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Convert to a JSON document."""
         checks = [
             {"check": title, "outcome": _outcome(line), "says": line.strip()}
             for title, line in self.lines.items()
@@ -70,10 +69,10 @@ class Checked(NamedTuple):
 
 
 def kind_of(name: str) -> str:
-    """Whether `name` is a tuner, a simulator, an effect or a diagnoser.
+    """Return whether a name is that of a tuner, simulator, effect or diagnoser.
 
     Raises:
-        InputError: it is none.
+        InputError: nothing is registered under this name.
     """
     for registry in REGISTRIES:
         if name in registry.names():
@@ -87,7 +86,16 @@ def _subject(kind: str, name: str) -> Any:
 
 
 def attempt(kind: str, name: str, place: int) -> str:
-    """Make one check in this process; returns what is wrong, or nothing."""
+    """Run one check in this process.
+
+    Args:
+        kind: kind of the subject.
+        name: name of the subject.
+        place: index of the check in its suite.
+
+    Returns:
+        Description of the failure, or an empty text.
+    """
     check, subject = SUITES[kind][place], _subject(kind, name)
     known = getattr(subject, "known_failures", {}).get(check.__name__)
     try:
@@ -104,7 +112,7 @@ def attempt(kind: str, name: str, place: int) -> str:
 
 
 def _raised_at(error: Exception) -> str:
-    """Where the subject's own code raised an exception, or else where it was raised at all."""
+    """Describe where the subject's own code raised an exception, or else where it was raised."""
     frames = traceback.extract_tb(error.__traceback__)
     packages = Path(__file__).parents[2]
     folders = [str(packages / name) for name in ("bench", "methods", "sims")]
@@ -114,15 +122,15 @@ def _raised_at(error: Exception) -> str:
 
 
 def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> Checked:
-    """Make every check and say how each ends.
+    """Run all checks and print the result of each.
 
     Args:
         name: registered name of a tuner, simulator, effect or diagnoser.
-        plugins: plugin files; loaded in this process already.
+        plugins: plugin files, which are already loaded in this process.
         say: prints a line.
 
     Raises:
-        InputError: no such name, or it cannot be used here.
+        InputError: the name does not exist, or the subject cannot be used here.
     """
     kind = kind_of(name)
     subject = _subject(kind, name)
@@ -137,7 +145,7 @@ def run(name: str, plugins: Sequence[str], say: Callable[[str], None]) -> Checke
 
 
 def _summary(checked: Checked) -> str:
-    """How many checks failed, and how many were not made."""
+    """Summarise how many checks failed and how many were not run."""
     outcomes = [_outcome(line) for line in checked.lines.values()]
     idle = {what: outcomes.count(what) for what in ("not tested", "not applicable")}
     made, failed = len(outcomes) - sum(idle.values()), outcomes.count("failed")
@@ -148,7 +156,7 @@ def _summary(checked: Checked) -> str:
 
 
 def _outcome(line: str) -> str:
-    """What the line of a check means."""
+    """Return the outcome that a check's line stands for."""
     for begin, outcome in _OUTCOMES.items():
         if line.startswith(begin):
             return outcome
@@ -156,7 +164,7 @@ def _outcome(line: str) -> str:
 
 
 def _mark(line: str) -> str:
-    """The word before a check's title."""
+    """Return the label printed before a check's title."""
     for begin, mark in _MARKS.items():
         if line.startswith(begin):
             return mark
@@ -164,9 +172,9 @@ def _mark(line: str) -> str:
 
 
 def _lines(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tuple[Check, str]]:
-    """Make the checks one after another; what each found is empty where all is well.
+    """Run the checks one after another, and yield each with its line (empty if it passed).
 
-    After two checks that had to be killed, or whose process died, no more are made.
+    After two checks that were killed or whose process died, no more checks are run.
     """
     failed: list[Check] = []
     lost = 0
@@ -179,7 +187,8 @@ def _lines(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tuple[Check
             elif lost == 2 or (lost and check in _HERE):
                 line = f"{_LEFT_OUT}the process of other checks died, or had to be killed"
             elif check in _HERE:
-                # It runs the subject in this process too, which is known to be safe by now.
+                # This check runs the subject in this process too; earlier checks have shown that
+                # this is safe.
                 line = attempt(kind, name, place)
             else:
                 ((_, end),) = pool.results([(attempt, (kind, name, place))], LIMIT)
@@ -191,7 +200,7 @@ def _lines(kind: str, name: str, plugins: Sequence[str]) -> Iterator[tuple[Check
 
 
 def _line(end: Any) -> str:
-    """What a check in a worker process found."""
+    """Return the line of a check that ran in a worker process."""
     if isinstance(end, TimeoutError):
         return f"expected an end within {LIMIT:g} s; found none; see what it waits for"
     if isinstance(end, InputError):

@@ -1,8 +1,7 @@
-"""The conformance suite of diagnosers: what every one of them must do, whatever its method.
+"""Conformance checks of diagnosers, independent of their method.
 
-They are checked on two small recordings of a slider, one with strong linear drag and one without
-anything hidden. Nothing is asked about who is right: that is measured (`simgap compare
-diagnosis-small`).
+The checks use two small recordings of a slider, one with strong linear drag and one without a
+hidden cause. Accuracy is not checked but measured (`simgap compare diagnosis-small`).
 """
 
 from __future__ import annotations
@@ -35,21 +34,21 @@ from sims.tally import TALLY, SpentError
 
 SYSTEM = "slider"
 BUDGET = 60_000
-"""Simulations for an answer."""
+"""Simulation budget of an answer."""
 FEW = 40
-"""Simulations with which hardly anything can be done."""
+"""Simulation budget that is too small for a useful answer."""
 LESSON = 12_000
-"""Simulations to learn from: few, so that the suite stays quick."""
+"""Simulation budget of the training; small, so that the suite is fast."""
 SECONDS = 60.0
-"""For an answer."""
+"""Time limit of an answer, seconds."""
 
 LEARNED: dict[type[Diagnoser], dict[str, Array]] = {}
-"""What each diagnoser learned in this process."""
+"""Trained state of each diagnoser in this process."""
 
 
 @cache
 def _made(hidden: bool) -> SimulatedRecording:
-    """A recording of the slider, with strong drag or with nothing hidden."""
+    """Simulate a recording of the slider, with strong drag or without a hidden cause."""
     return make(
         Wish(
             system=SYSTEM,
@@ -70,7 +69,7 @@ def _made(hidden: bool) -> SimulatedRecording:
 def _case(
     kind: type[Diagnoser], hidden: bool = True, budget: int = BUDGET, missing: bool = False
 ) -> Iterator[Case]:
-    """A case as a diagnoser gets it, its folder gone afterwards."""
+    """Make a case as a diagnoser gets it; its folder is deleted afterwards."""
     made = _made(hidden)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.csv"
@@ -98,7 +97,7 @@ def _case(
 
 
 def _with_gaps(recording: Recording) -> Recording:
-    """The recording with every seventh sample missing."""
+    """Return the recording with every seventh sample missing."""
     runs = []
     for run in recording.runs:
         channels = {name: values.copy() for name, values in run.channels.items()}
@@ -109,7 +108,7 @@ def _with_gaps(recording: Recording) -> Recording:
 
 
 def _learned(kind: type[Diagnoser]) -> dict[str, Array]:
-    """What a diagnoser learns from a small budget, once a process."""
+    """Train a diagnoser with a small budget, once per process."""
     if not kind.learned:
         return {}
     if kind not in LEARNED:
@@ -131,13 +130,13 @@ def _taught(kind: type[Diagnoser]) -> tuple[dict[str, Array], int]:
 
 
 class _Run(NamedTuple):
-    """One answer, and what was left behind.
+    """Answer of a diagnoser and side effects of the diagnosis.
 
     Attributes:
-        answer: what was said.
-        foreign: names that the recording could not show.
-        changed: whether the recording or its files were.
-        touched: what of the global random state was; empty for nothing.
+        answer: the answer.
+        foreign: named effects that the recording could not show.
+        changed: whether the recording or its files were changed.
+        touched: description of changes of the global random state; empty for none.
     """
 
     answer: Answer
@@ -148,7 +147,7 @@ class _Run(NamedTuple):
 
 @cache
 def _asked(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) -> _Run:  # noqa: ARG001
-    """A run that several checks look at; another turn is another run of the same."""
+    """Run a diagnoser; the result is cached for several checks, once for each value of `turn`."""
     with _case(kind, hidden) as case:
         before, touched = _bytes(case), ""
         answers: list[Answer] = []
@@ -156,7 +155,7 @@ def _asked(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) -> _Run:  
             with global_random_state_untouched(f"case.rng in {kind.__name__}.diagnose"):
                 answers.append(_answer(kind, case))
         except CheckError as error:
-            # One that gave no answer has nothing else to be looked at.
+            # Without an answer, there is nothing else to check.
             if not answers:
                 raise
             touched = str(error)
@@ -167,10 +166,10 @@ def _asked(kind: type[Diagnoser], hidden: bool = True, turn: int = 0) -> _Run:  
 
 
 def _answer(kind: type[Diagnoser], case: Case) -> Answer:
-    """What it says, checked.
+    """Run a diagnoser and validate its answer.
 
     Raises:
-        CheckError: it is no answer.
+        CheckError: the result is not a valid answer.
     """
     given = kind().diagnose(case)
     try:
@@ -190,7 +189,7 @@ def _bytes(case: Case) -> list[bytes]:
 
 
 def check_answers(kind: type[Diagnoser]) -> None:
-    """It answers about a recording with a cause in it, and about one without."""
+    """Check that the diagnoser answers about a recording with a cause, and about one without."""
     for hidden in (True, False):
         answer = _asked(kind, hidden).answer
         empty = answer.verdict in ("named", "ambiguous") and not answer.causes
@@ -198,7 +197,7 @@ def check_answers(kind: type[Diagnoser]) -> None:
 
 
 def check_names_what_there_is(kind: type[Diagnoser]) -> None:
-    """What it names are effects that this recording could show, each once in a set."""
+    """Check that named effects are observable in the recording, and occur once in a set."""
     run, look = _asked(kind), f"{kind.__name__}.diagnose"
     require(not run.foreign, "names of case.library", run.foreign, look)
     double = [names for names in names_in(run.answer) if len(set(names)) < len(names)]
@@ -206,24 +205,24 @@ def check_names_what_there_is(kind: type[Diagnoser]) -> None:
 
 
 def check_same_answer_again(kind: type[Diagnoser]) -> None:
-    """Asked again with the same chance it says the same."""
+    """Check that the same random seed gives the same answer."""
     first, again = (_asked(kind, turn=turn).answer.document() for turn in (0, 1))
     require(first == again, "the same answer again", again, f"case.rng in {kind.__name__}")
 
 
 def check_leaves_the_recording_alone(kind: type[Diagnoser]) -> None:
-    """It changes neither the arrays that it is given nor the files."""
+    """Check that neither the arrays nor the files of the recording are changed."""
     require(not _asked(kind).changed, "the recording as it was", "another one", kind.__name__)
 
 
 def check_leaves_global_chance_alone(kind: type[Diagnoser]) -> None:
-    """All of its chance comes from case.rng."""
+    """Check that all random numbers come from case.rng."""
     if said := _asked(kind).touched:
         raise CheckError(said)
 
 
 def check_keeps_to_its_budget(kind: type[Diagnoser]) -> None:
-    """With hardly any simulations it answers, or stops in the error that says so."""
+    """Check that the diagnoser answers with a tiny budget, or stops with the budget error."""
     with _case(kind, budget=FEW) as case:
         try:
             _answer(kind, case)
@@ -234,13 +233,13 @@ def check_keeps_to_its_budget(kind: type[Diagnoser]) -> None:
 
 
 def check_takes_missing_samples(kind: type[Diagnoser]) -> None:
-    """It answers about a recording with gaps."""
+    """Check that the diagnoser answers about a recording with missing samples."""
     with _case(kind, missing=True) as case:
         _answer(kind, case)
 
 
 def check_learns_within_its_budget(kind: type[Diagnoser]) -> NotApplicable | None:
-    """What it learns are arrays of numbers, from no more simulations than it was given."""
+    """Check that the training stays within its budget and results in numeric arrays."""
     if not kind.learned:
         return NotApplicable("it does not learn")
     arrays, used = _taught(kind)
@@ -265,9 +264,9 @@ DIAGNOSER_CHECKS: tuple[Check, ...] = (
     check_takes_missing_samples,
     check_learns_within_its_budget,
 )
-"""Every check, in the order in which they are made."""
+"""All checks of diagnosers, in the order in which they run."""
 
 DIAGNOSER_NEEDS: Mapping[Check, tuple[Check, ...]] = dict.fromkeys(
     DIAGNOSER_CHECKS[1:], (check_answers,)
 )
-"""Checks that mean nothing where another one fails."""
+"""For each check, the checks that must pass for it to be meaningful."""

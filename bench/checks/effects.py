@@ -1,6 +1,4 @@
-"""Conformance of an effect; each check takes the effect's class and runs it on every system that
-can have it.
-"""
+"""Conformance checks of an effect on every system that can have it."""
 
 from __future__ import annotations
 
@@ -42,13 +40,13 @@ from sims.system import (
 
 _NAME = re.compile(r"[a-z]+(\.[a-z_]+)?$")
 _SAMPLES = 60
-"""Samples of a run."""
+"""Number of samples of a run."""
 _RATE = 30.0
-"""Samples a second."""
+"""Sampling rate of a run, Hz."""
 
 
 def _declared() -> Iterator[type[Simulated]]:
-    """Registered simulators of declared systems whose packages are installed."""
+    """Yield the registered simulators of declared systems whose packages are installed."""
     for name in simulators.names():
         with suppress(SkippedError):
             kind = simulators.get(name)
@@ -57,14 +55,18 @@ def _declared() -> Iterator[type[Simulated]]:
 
 
 def _hosts(effect: type[Effect]) -> Iterator[type[Simulated]]:
-    """Those that can have the effect."""
+    """Return the simulators whose systems can have the effect."""
     kinds: tuple[type[Simulated], ...] = (*_declared(), Tub)
     return (kind for kind in kinds if not effect.misses(kind.system))
 
 
 def _made(host: type[Simulated], effect: type[Effect]) -> Simulated:
-    """The host with this effect, registered or not; on the batch engine, or on its own where it
-    steps itself.
+    """Make a simulator with the effect, and register the effect if necessary.
+
+    It uses the batch engine, or its own engine if it is a user-defined simulator.
+
+    Raises:
+        CheckError: another effect has the same name.
     """
     known = effects.names()
     if effect.name not in known or effects.get(effect.name) is not effect:
@@ -81,20 +83,21 @@ def _engine(host: type[Simulated]) -> str | None:
 
 
 def _scenario(system: type[System]) -> Scenario:
-    """A run in which everything moves: speed in every direction, an input that changes."""
+    """Make a run with nonzero velocities in all directions and inputs that change."""
     times = np.arange(_SAMPLES) / _RATE
-    # What is no coordinate and no rate, as a level, has its place among the rates.
+    # Initial values of states that are neither coordinates nor rates, such as levels, are among the
+    # rates.
     initial = dict.fromkeys(system.rates, 0.7) | dict.fromkeys(system.coordinates, 0.4)
     if system.bounces:
         initial[system.coordinates[-1]] = 2.0
-    # Both signs and a change every 0.4 s, so that dead bands, delays and lags all show.
+    # Both signs and a change every 0.4 s, so that dead bands, delays and lags are observable.
     inputs = {c.name: np.where(times % 0.8 < 0.4, 1.1, -0.3) for c in system.inputs}
     return Scenario(times, initial, inputs)
 
 
 def _theta(simulator: Simulated, share: float) -> Array:
-    """Nominal parameters, and every coefficient at a share of its plausible range."""
-    # Behind the system's own parameters stand the effect's coefficients.
+    """Return nominal parameters, and all coefficients at a fraction of their plausible range."""
+    # The coefficients of the effect follow the parameters of the system.
     own = len(simulator.system.parameters)
     values = [p.nominal for p in simulator.parameters[:own]]
     values += [
@@ -104,8 +107,10 @@ def _theta(simulator: Simulated, share: float) -> Array:
 
 
 def check_declaration_is_complete(effect: type[Effect]) -> None:
-    """Name, sentence, source, and for each coefficient a unit and a range on at least one kind of
-    system.
+    """Check that the declaration of the effect is complete.
+
+    It needs a name, a description and a source, and for each coefficient a unit and a range on at
+    least one kind of system.
     """
     look = effect.__name__
     require(bool(_NAME.match(effect.name)), "a name family.form in lower case", effect.name, look)
@@ -126,9 +131,10 @@ def check_declaration_is_complete(effect: type[Effect]) -> None:
 
 
 def check_contribution_is_nothing_at_zero(effect: type[Effect]) -> NotApplicable | None:
-    """What the hook gives at zero is exactly nothing, bit for bit.
+    """Check that the effect contributes nothing at zero, bit for bit.
 
-    Asked of the hook itself: engines leave out what is off, so a simulation would not show it.
+    The hook itself is called: engines skip effects that are zero, so a simulation would not show a
+    contribution.
     """
     hosts = list(_hosts(effect))
     for host in hosts:
@@ -144,13 +150,13 @@ def check_contribution_is_nothing_at_zero(effect: type[Effect]) -> NotApplicable
 def _contributions(
     acting: Effect, c: Array, host: type[Simulated], system: System
 ) -> list[tuple[Array, Array]]:
-    """Pairs of what the effect's hook gives and what it should give where the effect is off."""
+    """Return pairs of the hook's result and the expected result of an inactive effect."""
     moment = _moment(host, system)
     speed, e = np.array([[0.3], [2.0]]), np.array([[0.4], [0.8]])
     values = np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.6]])
     times = np.cumsum(np.full((2, 3), 0.1), axis=1)
     signal = Signal(values, np.full((2, 3), 0.1), np.array([[0.7], [0.2]]), times)
-    # Adding zero turns the -0.0 of a product with zero into 0.0, which is nothing as well.
+    # Adding zero turns -0.0, the result of a product with zero, into 0.0.
     if isinstance(acting, Force):
         return [(acting.force(c, moment) + 0.0, np.zeros_like(moment.x))]
     if isinstance(acting, Friction):
@@ -163,7 +169,7 @@ def _contributions(
     if isinstance(acting, Input):
         return [(acting.times(c, times), times), (acting.feel(c, signal), values)]
     if isinstance(acting, Hidden):
-        return []  # the engines ask it for nothing where its first coefficient is zero
+        return []  # engines do not call it if its first coefficient is zero
     if isinstance(acting, Sensor):
         return [(acting.times(c, times), times), (acting.read(c, signal), values)]
     if isinstance(acting, Level):
@@ -174,7 +180,7 @@ def _contributions(
 
 
 def _moment(host: type[Simulated], system: System) -> Moment:
-    """Two lanes in motion."""
+    """Make the state of two batch elements in motion."""
     shape = (2, len(system.coordinates))
     theta = np.repeat([[p.nominal for p in system.parameters]], 2, axis=0)
     constants = {c.name: np.full((2, 1), c.value) for c in host.constants}
@@ -192,11 +198,11 @@ def _moment(host: type[Simulated], system: System) -> Moment:
 
 
 def check_it_shows_and_stays_finite(effect: type[Effect]) -> NotApplicable | None:
-    """Somewhere inside its plausible range it changes the observation; well above the middle
-    nothing becomes NaN.
+    """Check that the effect changes the observations and keeps them finite.
 
-    Several places, since a limit acts at its low end, where a force may pull a system away for
-    good.
+    The change must occur somewhere within the plausible range; the observations at 0.7 of the range
+    must be finite. Several fractions of the range are tested, because a limit acts at the low end
+    of its range, and a force may destabilise the system at the high end.
     """
     hosts = list(_hosts(effect))
     for host in hosts:
@@ -215,7 +221,7 @@ def check_it_shows_and_stays_finite(effect: type[Effect]) -> NotApplicable | Non
 
 
 def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
-    """A lane's observation does not depend on the coefficients of its neighbours, bit for bit."""
+    """Check that observations do not depend on other elements of the batch, bit for bit."""
     hosts = list(_hosts(effect))
     for host in hosts:
         simulator, scenario = _made(host, effect), _scenario(host.system)
@@ -232,7 +238,7 @@ def check_lanes_are_independent(effect: type[Effect]) -> NotApplicable | None:
 
 
 def check_impossible_hosts_are_refused(effect: type[Effect]) -> NotApplicable | None:
-    """A system that cannot have it says so by name."""
+    """Check that a system that cannot have the effect is rejected by name."""
     impossible = [host for host in _declared() if effect.misses(host.system)]
     for host in impossible:
         try:
@@ -278,4 +284,4 @@ EFFECT_NEEDS: Mapping[Check, tuple[Check, ...]] = {
         check_lanes_are_independent,
     ),
 }
-"""Checks that mean nothing where another one fails."""
+"""For each check, the checks that must pass for it to be meaningful."""

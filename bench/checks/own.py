@@ -1,4 +1,4 @@
-"""Conformance of a user's own simulator: the methods that only such a simulator has."""
+"""Conformance checks of the methods that only user-defined simulators have."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from sims.own import OwnSimulator
 from sims.own_engine import inertia_of, observed
 
 _STEPS = 20
-"""Steps of a run in which a force is applied."""
+"""Number of steps of a run in which a force is applied."""
 _LARGEST = 1e6
-"""Largest force that is tried, in N, N m or m/s^2: a small one may not overcome a friction."""
+"""Maximum force that is tried, in N, N m or m/s^2; a small force may not overcome friction."""
 _LATER = 5
-"""After this many steps, a force that acted in the first step alone must not have grown."""
+"""Number of steps after which the effect of a force in the first step must not have grown."""
 _GROWN = 2.5
-"""Ratio of velocities above which it has."""
+"""Ratio of velocity changes above which the effect of a force has grown."""
 
 
 def _own(kind: type[Simulator]) -> type[OwnSimulator] | None:
@@ -27,7 +27,7 @@ _NOT_OWN = NotApplicable("it is not a subclass of OwnSimulator")
 
 
 def _started(simulator: OwnSimulator) -> None:
-    """Begin a run with the nominal parameters, the usual constants and the default states."""
+    """Start a run with nominal parameters, default constants and default states."""
     theta = {p.name: p.nominal for p in simulator.parameters}
     constants = {c.name: c.value for c in simulator.constants}
     simulator.reset(theta, constants, dict(simulator.states))
@@ -38,8 +38,10 @@ def _step(simulator: OwnSimulator) -> None:
 
 
 def check_hooks_have_the_declared_shapes(kind: type[Simulator]) -> NotApplicable | None:
-    """`observe` gives a number for every channel, coordinate, rate and level; `inertia` a number
-    or a positive definite matrix (D, D); `apply_force` takes (D,).
+    """Check the types and shapes of the results of `observe`, `inertia` and `apply_force`.
+
+    `observe` must return a number for every channel, coordinate, rate and level. `inertia` must
+    return a number or a positive definite matrix (D, D). `apply_force` must accept (D,).
     """
     own = _own(kind)
     if own is None:
@@ -82,7 +84,7 @@ def _check_inertia(kind: type[OwnSimulator], given: float | Array) -> None:
 
 
 def check_step_goes_on_by_its_seconds(kind: type[Simulator]) -> NotApplicable | None:
-    """Steps of half the length, twice as many, lead to about the same state."""
+    """Check that twice as many steps of half the length lead to about the same state."""
     own = _own(kind)
     if own is None:
         return _NOT_OWN
@@ -100,17 +102,18 @@ def check_step_goes_on_by_its_seconds(kind: type[Simulator]) -> NotApplicable | 
 
 
 _FEW = 8
-"""Steps that are compared with twice as many of half their length."""
+"""Number of steps that are compared with twice as many of half their length."""
 _FARTHER = 1.6
-"""Ratio of ways above which the length of steps is ignored: it is 2 or more then, and near 1 for
-any integrator that resolves the motion.
+"""Ratio of distances above which the simulator ignores the length of a step.
+
+The ratio is then 2 or more; it is near 1 for any integrator that resolves the motion.
 """
 _ROUNDING = 1e-9
-"""Way of a channel, in units of its scale, below which it has not moved."""
+"""Minimum change of a channel, in units of its scale, that counts as motion."""
 
 
 def _way(simulator: OwnSimulator, seconds: float, steps: int) -> Array:
-    """(C,) the change of every channel over a run, in units of its scale."""
+    """Compute the change (C,) of every channel over a run, in units of its scale."""
     inputs = {c.name: c.scale for c in simulator.inputs}
 
     def seen() -> Array:
@@ -125,8 +128,9 @@ def _way(simulator: OwnSimulator, seconds: float, steps: int) -> Array:
 
 
 def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
-    """A force along each coordinate changes the motion, acts for one step alone, and does not act
-    in the next run.
+    """Check that a force along each coordinate changes the motion, and acts for one step only.
+
+    It must not act in the next run.
     """
     own = _own(kind)
     if own is None:
@@ -159,7 +163,7 @@ def check_forces_act(kind: type[Simulator]) -> NotApplicable | None:
 
 
 def _motion(simulator: OwnSimulator, force: Array | None) -> Array:
-    """(K + 1, 2 D) coordinates and rates of a run; the force acts in its first step."""
+    """Simulate coordinates and rates (K + 1, 2 D) of a run; the force acts in its first step."""
     names = (*simulator.coordinates, *simulator.rates)
     _started(simulator)
     rows = []
@@ -173,7 +177,7 @@ def _motion(simulator: OwnSimulator, force: Array | None) -> Array:
 
 
 def check_levels_can_be_set(kind: type[Simulator]) -> NotApplicable | None:
-    """After `put`, `observe` gives the new level, and the other levels are as they were."""
+    """Check that `put` sets a level, which `observe` returns, and leaves other levels unchanged."""
     own = _own(kind)
     if own is None:
         return _NOT_OWN

@@ -1,6 +1,4 @@
-"""Conformance of an effect at the places of a robot; each check takes the effect's class and runs
-it on the arm of `bench.checks.arm` wherever it can act there.
-"""
+"""Conformance checks of an effect at the places of a robot, on the arm of `bench.checks.arm`."""
 
 from __future__ import annotations
 
@@ -15,12 +13,14 @@ from sims.system import Effect, Force, Friction, Hidden, Sensor, State, Value
 
 NOWHERE = NotApplicable("a robot has no place for it")
 _SHARES = (0.3, 0.9)
-"""Of a plausible range: coefficients of the lanes."""
+"""Fractions of the plausible range at which coefficients of the batch elements are set."""
 
 
 def check_places_are_declared(effect: type[Effect]) -> NotApplicable | None:
-    """At each place it has a name, and for each coefficient a unit and a finite range; a place that
-    does not exist is refused with those that do.
+    """Check that the effect is declared at each place of the robot.
+
+    It needs a name, and for each coefficient a unit and a finite range. A place that does not exist
+    must be rejected with a list of those that do.
     """
     classes = placed(effect)
     for one in classes:
@@ -50,8 +50,10 @@ def _refuses(effect: type[Effect], places: Sequence[str]) -> None:
 
 
 def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | None:
-    """At each place a coefficient of zero adds no force, changes no number of the model and nothing
-    of the motion, bit for bit, whatever the lanes beside it do.
+    """Check that the effect at a place has no influence at zero, bit for bit.
+
+    It must add no force and change neither the model nor the motion, whatever other batch elements
+    do.
     """
     classes = placed(effect)
     kind = arm(effect)
@@ -69,8 +71,9 @@ def check_nothing_at_zero_at_a_place(effect: type[Effect]) -> NotApplicable | No
 
 
 def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | None:
-    """Inside its plausible range it changes the motion or what is seen, well above the middle
-    nothing becomes NaN, and it touches what is at its place alone.
+    """Check that the effect is observable, stays finite, and acts only at its place.
+
+    The observations must be finite at 0.9 of the plausible range.
     """
     classes = placed(effect)
     kind = arm(effect)
@@ -80,7 +83,8 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
         thetas = np.concatenate([_theta(one, share) for share in (0.05, *_SHARES)])
         seen = kind(observe=OBSERVED, effects=[one]).simulate(thetas, scenario())
         plain = kind(observe=OBSERVED).simulate(np.empty((1, 0)), scenario())
-        # At the low end a force may pull a joint away for good.
+        # Only the last element is tested: at the low end of its range, a force may destabilise a
+        # joint.
         require(bool(np.isfinite(seen[-1]).all()), "finite observations", "others", look)
         shown = one.signal in ("", *OBSERVED) or not issubclass(one, Sensor)
         require(bool((seen != plain).any()) == shown, "a change where it is seen", "none", look)
@@ -96,14 +100,14 @@ def check_it_acts_at_its_place_alone(effect: type[Effect]) -> NotApplicable | No
 
 
 def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicable | None:
-    """All members with coefficients of their own move as the family with the same, bit for bit."""
+    """Check that an effect family equals its members with the same coefficients, bit for bit."""
     kind = arm(effect)
     families = [one for one in placed(effect) if hasattr(one, "members")]
     for whole in families:
         members = [type(member) for member in whole.members]
         one = kind(observe=OBSERVED, effects=[whole])
         several = kind(observe=OBSERVED, effects=members)
-        # A family of one number has it at every place.
+        # A family with one coefficient applies it at every place.
         shared = len(one.parameters) < len(several.parameters)
         theta = _theta(whole, 0.3)
         each = np.tile(theta, len(members)) if shared else theta
@@ -117,8 +121,10 @@ def check_family_is_the_sum_of_its_members(effect: type[Effect]) -> NotApplicabl
 
 
 def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicable | None:
-    """A lane's observation does not hang on the lanes beside it, nor on their order, bit for bit,
-    wherever the effect acts in each of them.
+    """Check that observations do not depend on other elements of the batch, bit for bit.
+
+    The order of the batch elements must not matter either. The effect acts at another place in each
+    of them.
     """
     classes = placed(effect)
     simulator = arm(effect)(observe=OBSERVED, effects=classes)
@@ -141,16 +147,22 @@ def check_lanes_of_a_robot_are_independent(effect: type[Effect]) -> NotApplicabl
 
 
 def _theta(effect: type[Effect], share: float) -> Array:
-    """(1, K) coefficients at a share of the plausible ranges; zero for none."""
+    """Return coefficients (1, K) at a fraction of their plausible ranges; all zero for 0."""
     ends = np.array([c.plausible[0] for c in effect.coefficients])
     theta: Array = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
     return theta[None] * (share != 0.0)
 
 
 def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
-    """What an effect at one place touches with coefficients (K, 2, 1): fields of the model with
-    their places, coordinates that it pushes, the signal that it changes; nothing where it leaves
-    all as it is.
+    """Return what an effect at one place changes.
+
+    Args:
+        effect: the effect.
+        c: coefficients, (K, 2, 1).
+        kind: simulator class of the robot.
+
+    Returns:
+        Model fields with indices, coordinates with forces, or the signal; empty if nothing changes.
     """
     from sims.robot.native import FIELDS
 
@@ -164,7 +176,7 @@ def _acts_on(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
 
 
 def _written(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
-    """Model fields that it changes, each with the places of the numbers in it."""
+    """Return the model fields that an effect changes, with the indices of the changed numbers."""
     from sims.robot.coupled import ANY as COUPLED
     from sims.robot.native import FIELDS
     from sims.robot.series import in_series
@@ -182,14 +194,14 @@ def _written(effect: Effect, c: Array, kind: type) -> tuple[object, ...]:
     for name, values in fields.items():
         places = np.nonzero(values != before[name])[1]
         changes += [(name, int(place)) for place in np.unique(places)]
-    # Of numbers that lie by place, all at one; those of the world lie by axis.
+    # Fields indexed by place must change at one place; fields of the world are indexed by axis.
     if effect.place and len({place for _, place in changes}) > 1:
         raise CheckError(f"expected one place; found {changes}; see {effect.name}")
     return tuple(changes)
 
 
 def _put_in_series(effect: Hidden, c: Array, kind: type) -> tuple[object, ...]:
-    """Numbers of the joint in series with its own that it writes, by the joint's number."""
+    """Return the model fields that an effect changes on the joint in series with its own joint."""
     from sims.robot import series
 
     if not c.any():
@@ -204,7 +216,7 @@ def _put_in_series(effect: Hidden, c: Array, kind: type) -> tuple[object, ...]:
 
 
 def _pushed(effect: Force | Friction | Hidden, c: Array, kind: type) -> tuple[object, ...]:
-    """Coordinates along which it pushes or rubs."""
+    """Return the coordinates on which an effect exerts a force or friction."""
     from sims.robot.forces import moment_of
 
     system = kind.system()  # type: ignore[attr-defined]

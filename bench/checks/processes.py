@@ -1,4 +1,4 @@
-"""Calls in other processes, for checks: the same worker processes serve one check after another."""
+"""Calls of functions in worker processes, for checks; all checks share the worker pools."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bench.runs.pools import LocalPool
 from bench.runs.survey import Plugin
 
 LIMIT = 120.0
-"""Seconds that one call may take before it is killed."""
+"""Timeout of one call, seconds."""
 
 
 @cache
@@ -26,14 +26,16 @@ def _pool(workers: int, plugins: tuple[str, ...]) -> LocalPool:
 def elsewhere(
     function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], workers: int, subject: type
 ) -> list[Any]:
-    """The result (or exception) of `function` for each of `arguments`, each in one of so many
-    worker processes.
+    """Call a function in worker processes, once for each tuple of arguments.
 
     Args:
-        function: importable.
-        arguments: of each call; `subject` is among them.
-        workers: processes.
-        subject: the class under test; where it comes from a plugin file, workers load that file.
+        function: an importable function.
+        arguments: arguments of each call; `subject` is among them.
+        workers: number of worker processes.
+        subject: class under test; if it comes from a plugin file, the workers load that file.
+
+    Returns:
+        The result or exception of each call.
     """
     plugins = (inspect.getfile(subject),) if subject.__module__.startswith("simgap_plugin_") else ()
     results = dict(

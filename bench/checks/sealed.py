@@ -1,4 +1,4 @@
-"""Whether a tuner can live in the process that a comparison gives it."""
+"""Conformance check of a tuner in its isolated process."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from bench.sealing.seals import ROOT
 from methods.base import Tuner
 
 _BUDGET = 5
-"""Simulations of a run here: enough for a tuner to do whatever it does."""
+"""Number of simulations of a run, enough for a tuner to use all of its features."""
 _SEED = 0
 
 
 def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
-    """It runs in a process that starts no other and reaches no file and no network, and does there
-    what it does here.
+    """Check that the tuner runs in an isolated process, with the same result as in this process.
+
+    An isolated process cannot start other processes and cannot access files or the network.
     """
     tuned = _housed_as(kind)
     if tuned is None:
@@ -49,13 +50,13 @@ def check_same_run_when_sealed(kind: type[Tuner]) -> NotApplicable | None:
 
 
 def _housed_as(kind: type[Tuner]) -> Tuned | None:
-    """How a class is built in another process; None where none can."""
+    """Return the tuner specification for an isolated process; None if the class cannot load."""
     module = sys.modules.get(kind.__module__)
     if getattr(module, kind.__name__, None) is not kind:
         return None
     file = inspect.getsourcefile(kind) or ""
     if kind.__module__.startswith("simgap_plugin_"):
         return Tuned(kind.name, "", file, {}, ahead_of(file))
-    # What a script or a test defines lies where a tuner's process does not reach.
+    # A class of a script or a test is in a file that an isolated process cannot read.
     own = file.startswith(str(ROOT / "methods")) or "site-packages" in file
     return Tuned(kind.name, kind.__module__, "", {}, ahead_of(file)) if own else None

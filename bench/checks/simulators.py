@@ -1,4 +1,4 @@
-"""Conformance of a simulator; each check takes the simulator's class, and works on its defaults."""
+"""Conformance checks of a simulator, with its default options."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _NAME = re.compile(r"[a-z][a-z0-9_.]*$")
 def _scenario(
     kind: type[Simulator], samples: int = 40, rate: float = 60.0, size: float = 0.0
 ) -> Scenario:
-    """A run from the default initial state.
+    """Make a run from the default initial state.
 
     Args:
-        kind: the simulator's class.
-        samples: their number.
+        kind: class of the simulator.
+        samples: number of samples.
         rate: samples per second.
         size: amplitude of the inputs, in units of their `scale`.
     """
@@ -46,7 +46,7 @@ def _named(kind: type[Simulator]) -> list[Parameter | Channel | Constant]:
 
 
 def check_declaration_is_complete(kind: type[Simulator]) -> None:
-    """Names are plain, a sentence is there, nothing is declared twice."""
+    """Check that the declaration has valid names and a description, and no duplicates."""
     look = kind.__name__
     require(
         bool(kind.parameters and kind.channels and kind.says),
@@ -60,13 +60,13 @@ def check_declaration_is_complete(kind: type[Simulator]) -> None:
         names = [thing.name for thing in group]
         require(len(set(names)) == len(names), "different names", names, look)
     for thing in _named(kind):
-        # The names of a robot are those of its model file, which may hold anything.
+        # The names of a robot are those of its model file and may contain any character.
         plain = kind.has_model or bool(_NAME.match(thing.name))
         require(plain, "a name in lower case", thing.name, look)
 
 
 def check_units_are_known(kind: type[Simulator]) -> None:
-    """Every parameter, channel, constant and input has a unit that can be converted."""
+    """Check that every parameter, channel, constant and input has a unit that can be converted."""
     for thing in _named(kind):
         require(
             is_unit(thing.unit),
@@ -77,7 +77,7 @@ def check_units_are_known(kind: type[Simulator]) -> None:
 
 
 def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
-    """(n, T, C), finite, for any number of parameter vectors and samples."""
+    """Check that observations are (n, T, C) and finite, for several n and T."""
     simulator, look = kind(), f"{kind.__name__}.simulate"
     for n, samples in ((1, 2), (3, 40), (1, 1)):
         seen = simulator.simulate(_points(simulator, n), _scenario(kind, samples))
@@ -91,12 +91,14 @@ def check_observations_have_the_declared_shape(kind: type[Simulator]) -> None:
 
 
 def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
-    """A run depends on nothing that was simulated before, in this simulator or another, and on no
-    other parameter vector of the same call.
+    """Check that a simulation is reproducible bit for bit.
+
+    It must not depend on earlier simulations, in this simulator or another, nor on other parameter
+    vectors of the same call.
     """
     simulator, other = kind(), kind()
     points = _points(simulator, 6)
-    # Inputs that are not zero: what they leave behind, such as heat, would not show otherwise.
+    # Nonzero inputs, because their lasting effects, such as heat, would not be visible otherwise.
     run, longer = _scenario(kind, size=1.0), _scenario(kind, 300, 50.0, size=3.0)
     together = simulator.simulate(points.copy(), run)
 
@@ -121,7 +123,7 @@ def check_same_proposal_gives_the_same_bits(kind: type[Simulator]) -> None:
 
 
 def _first_difference(kind: type[Simulator], expected: Array, seen: Array) -> str:
-    """Where two observations (n, T, C) first differ in time, in words."""
+    """Describe where two observations (n, T, C) first differ in time."""
     if expected.shape != seen.shape:
         return f"shape {seen.shape} in place of {expected.shape}"
     differs = (expected != seen) & ~(np.isnan(expected) & np.isnan(seen))
@@ -129,14 +131,14 @@ def _first_difference(kind: type[Simulator], expected: Array, seen: Array) -> st
         return "zeros of another sign"
     lane, sample, channel = min(np.argwhere(differs).tolist(), key=lambda at: at[1])
     before, after = expected[lane, sample, channel], seen[lane, sample, channel]
-    # Where rounding alone differs, every digit.
+    # All digits are shown if the values differ only by rounding.
     digits = 6 if f"{before:.6g}" != f"{after:.6g}" else 17
     name = kind.channels[channel].name
     return f"{name} = {after:.{digits}g} in place of {before:.{digits}g} at sample {sample}"
 
 
 def check_arguments_are_not_changed(kind: type[Simulator]) -> None:
-    """`theta` and the scenario are the caller's."""
+    """Check that the simulator does not change `theta` and the scenario."""
     simulator, scenario = kind(), _scenario(kind)
     points = _points(simulator, 3)
     before, times = points.copy(), scenario.times.copy()
@@ -151,11 +153,11 @@ def check_arguments_are_not_changed(kind: type[Simulator]) -> None:
 
 
 def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simulator]) -> None:
-    """A lane with a NaN parameter is all NaN, its neighbours are as without it."""
+    """Check that a NaN parameter makes its own batch element NaN, and no other."""
     simulator, look = kind(), f"{kind.__name__}.simulate"
     points = _points(simulator, 3)
     clean = simulator.simulate(points, _scenario(kind))
-    # The middle one, so that it has neighbours on both sides.
+    # The middle element has neighbours on both sides.
     points[1] = np.nan
     seen = simulator.simulate(points, _scenario(kind))
     require(bool(np.isnan(seen[1]).all()), "a lane of NaN", seen[1][:2], look)
@@ -164,13 +166,13 @@ def check_parameters_that_are_not_numbers_spoil_only_their_lane(kind: type[Simul
 
 
 def check_every_parameter_shows(kind: type[Simulator]) -> None:
-    """Each parameter changes some channel, in a run of ten seconds."""
+    """Check that each parameter changes some channel, in a run of ten seconds."""
     simulator = kind(observe=[c.name for c in kind.channels])
     cube = UnitCube(simulator.parameters)
-    # Inside the training range: far from it, a large friction may hold everything still.
+    # Points inside the training range: outside it, a large friction may prevent all motion.
     low, high = cube.training
     points = np.tile(low + 0.4 * (high - low), (1 + cube.dim, 1))
-    # One point for each parameter, moved in that direction alone.
+    # One point for each parameter, changed in that direction alone.
     points[1:] += 0.2 * np.diag(high - low)
     inputs = {c.name: np.ones(600) for c in simulator.inputs}
     seen = simulator.simulate(cube.physical(points), Scenario(np.arange(600) / 60.0, inputs=inputs))
@@ -185,7 +187,7 @@ def check_every_parameter_shows(kind: type[Simulator]) -> None:
 
 
 def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
-    """Each initial state changes some channel, in a run of ten seconds."""
+    """Check that each initial state changes some channel, in a run of ten seconds."""
     if not kind.states:
         return NotApplicable("it has no initial state")
     simulator = kind(observe=[c.name for c in kind.channels])
@@ -207,12 +209,13 @@ def check_initial_states_show(kind: type[Simulator]) -> NotApplicable | None:
 
 
 _MOVED = 0.01
-"""By this share of its value, or of its channel's scale, an initial state is changed."""
+"""Change of an initial state, as a fraction of its value or of the scale of its channel."""
 
 
 def check_unknown_names_are_refused(kind: type[Simulator]) -> None:
-    """Constants, channels, inputs and initial states that do not exist give one line that lists
-    those that do.
+    """Check that unknown names are rejected by a message that contains them.
+
+    They are names of constants, channels, inputs and initial states.
     """
     scenarios = (
         Scenario(np.arange(3.0), initial={"no_such": 1.0}),
@@ -237,7 +240,7 @@ def check_unknown_names_are_refused(kind: type[Simulator]) -> None:
 
 
 def check_chosen_channels_are_the_same_columns(kind: type[Simulator]) -> NotApplicable | None:
-    """`observe` picks and orders columns, and changes no number."""
+    """Check that `observe` selects and orders columns without changing their values."""
     everything = kind()
     names = [c.name for c in everything.channels][::-1]
     if len(names) == 1:
@@ -291,4 +294,4 @@ SIMULATOR_NEEDS: Mapping[Check, tuple[Check, ...]] = {
     check_forces_act: (_REPEATS, check_hooks_have_the_declared_shapes),
     check_levels_can_be_set: (_REPEATS, check_hooks_have_the_declared_shapes),
 }
-"""Checks that mean nothing where another one fails."""
+"""For each check, the checks that must pass for it to be meaningful."""

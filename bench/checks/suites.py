@@ -1,4 +1,4 @@
-"""Which checks a subject has to pass, and how they are made in a plugin author's own tests."""
+"""Check suites by kind of subject, and their pytest parametrisation for authors of plugins."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ NEEDS: Mapping[Check, tuple[Check, ...]] = {
     **EFFECT_NEEDS,
     **DIAGNOSER_NEEDS,
 }
-"""The checks that must not have failed for a check to mean anything: one cause, one failure."""
+"""For each check, the checks that must pass for it to be meaningful.
+
+One cause then gives one failure.
+"""
 
 _BASES: dict[str, type] = {
     "tuner": Tuner,
@@ -42,16 +45,19 @@ _BASES: dict[str, type] = {
 
 
 def title_of(check: Check) -> str:
-    """What a check is called."""
+    """Return the title of a check."""
     return check.__name__.removeprefix("check_").replace("_", " ")
 
 
 def failed_need(check: Check, failed: Collection[Check]) -> Check | None:
-    """The failed check without which this one means nothing, directly or through others.
+    """Find the failed check that makes another check meaningless, directly or through others.
 
     Args:
-        check: not made yet.
-        failed: the checks of the same subject that have failed.
+        check: a check that has not been run.
+        failed: failed checks of the same subject.
+
+    Returns:
+        The failed check, or None.
     """
     for needed in NEEDS.get(check, ()):
         if needed in failed:
@@ -62,10 +68,10 @@ def failed_need(check: Check, failed: Collection[Check]) -> Check | None:
 
 
 def suite_of(subject: type) -> tuple[Check, ...]:
-    """The checks for a class.
+    """Return the checks for a class.
 
     Raises:
-        InputError: it is neither a tuner, a simulator, an effect nor a diagnoser.
+        InputError: the class is not a tuner, simulator, effect or diagnoser.
     """
     for kind, base in _BASES.items():
         if inspect.isclass(subject) and issubclass(subject, base):
@@ -76,18 +82,20 @@ def suite_of(subject: type) -> tuple[Check, ...]:
 
 
 def parametrize(*subjects: type) -> pytest.MarkDecorator:
-    """A pytest mark that makes one test of each conformance check of these classes::
+    """Make a pytest mark that runs each conformance check of some classes as one test.
+
+    Use it in a test module::
 
         @simgap.parametrize(MyTuner, MyEffect)
         def test_conformance(check):
             check()
 
-    A check that does not apply is skipped with its reason, and so is one that means nothing because
-    another has failed; one that stands in the subject's `known_failures` is expected to fail, and a
-    failure if it passes.
+    A check that does not apply is skipped with its reason. A check is also skipped if another check
+    that it needs has failed. A check in the subject's `known_failures` is expected to fail, and
+    counts as failed if it passes.
 
     Raises:
-        InputError: a subject is neither a tuner, a simulator, an effect nor a diagnoser.
+        InputError: a subject is not a tuner, simulator, effect or diagnoser.
     """
     import pytest
 
@@ -104,12 +112,12 @@ def parametrize(*subjects: type) -> pytest.MarkDecorator:
 
 
 def _bound(check: Check, subject: type, failed: set[Check]) -> Callable[[], None]:
-    """The check of this subject, as a test without arguments.
+    """Bind a check to its subject, as a test without arguments.
 
     Args:
-        check: to be made.
+        check: the check.
         subject: a class.
-        failed: the checks of this subject that have failed; this one is added if it fails.
+        failed: failed checks of this subject; this check is added if it fails.
     """
 
     def made() -> None:

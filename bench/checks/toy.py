@@ -1,11 +1,11 @@
-"""The problem that tuners are checked on: a smooth, identifiable simulator of any dimension.
+"""Toy problem for checks of tuners: a smooth, identifiable simulator of any dimension.
 
-Parameter i has the rate r_i = 0.5 + 0.6 p_i; the two channels are the sums over i = 1, 2, ... of
+Parameter i has the rate r_i = 0.5 + 0.6 p_i. The two channels are the sums over i = 1, 2, ... of
 
     cos(r_i t + 0.3 i) / i            (1)
     exp(-r_i t) (1 + 0.1 i)           (2)
 
-so that every parameter shows, none can take another's place, and no square of p is symmetric.
+so that every parameter is observable, no two can be exchanged, and there is no symmetry in p.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from methods.base import NOTHING, BudgetExceededError, Task, Tuner
 from sims.base import Array
 
 TIMES = np.linspace(0.0, 3.0, 40)
-"""Sample times of the toy simulator in seconds."""
+"""Sample times of the toy simulator, seconds."""
 FIT_BUDGET = 240
-"""Simulations that a learned tuner may train with: few, so that the suite stays quick."""
+"""Number of training simulations of a trained tuner; small, so that the suite is fast."""
 LOW = 0.25
-"""Lower end of the training range in every direction of the unit cube."""
+"""Lower bound of the training range in every direction of the unit cube."""
 HIGH = 0.75
-"""Its upper end."""
+"""Upper bound of the training range in every direction of the unit cube."""
 
 
 def observe(points: Array) -> Array:
-    """A smooth, identifiable toy simulator: (n, 40, 2) from (n, dim) points of the unit cube."""
-    # the i of (1) and (2)
+    """Simulate the toy problem: (n, 40, 2) from (n, dim) points of the unit cube."""
+    # index i of (1) and (2)
     phases = np.arange(1, points.shape[1] + 1)
     rates = 0.5 + 0.6 * points
     waves = np.cos(rates[:, None, :] * TIMES[:, None] + 0.3 * phases) / phases  # (1)
@@ -40,7 +40,7 @@ def observe(points: Array) -> Array:
 
 
 class PracticeGround:
-    """Practice ground on the toy simulator; see `methods.base.Practice`."""
+    """Training simulator of the toy problem; see `methods.base.Practice`."""
 
     def __init__(self, dim: int) -> None:
         self.dim, self.scale = dim, np.ones(2)
@@ -50,15 +50,27 @@ class PracticeGround:
         self.used, self.budget = 0, FIT_BUDGET
 
     def sample(self, rng: np.random.Generator, n: int) -> Array:
-        """Parameters drawn evenly from the training range."""
+        """Draw parameters uniformly from the training range.
+
+        Args:
+            rng: random generator.
+            n: number of points.
+        """
         return rng.uniform(LOW, HIGH, size=(n, self.dim))
 
     def simulate(self, rng: np.random.Generator, points: Array) -> Array:  # noqa: ARG002
-        """Observations (n, 40, 2), counted.
+        """Simulate points, and count the simulations.
+
+        Args:
+            rng: not used.
+            points: points in the unit cube, (n, dim).
+
+        Returns:
+            Observations, (n, 40, 2).
 
         Raises:
-            CheckError: a point outside the training range.
-            BudgetExceededError: more simulations than the training budget.
+            CheckError: a point is outside the training range.
+            BudgetExceededError: the training budget is exceeded.
         """
         if not ((points >= LOW) & (points <= HIGH)).all():
             raise CheckError(
@@ -71,12 +83,16 @@ class PracticeGround:
 
 
 LEARNED: dict[tuple[type[Tuner], int], dict[str, Array]] = {}
-"""What each tuner learned in this process, by class and dimension: training takes seconds."""
+"""Trained state of each tuner in this process, by class and dimension, because training is slow."""
 
 
 def ready(kind: type[Tuner], dim: int, anew: bool = False) -> Tuner:
-    """A tuner of this kind, trained on the toy simulator if it is a learned one: once a process,
-    unless anew.
+    """Make a tuner, trained on the toy problem if necessary.
+
+    Args:
+        kind: class of the tuner.
+        dim: number of parameters.
+        anew: whether to train again instead of using the cached state.
     """
     tuner = kind()
     if not anew and (kind, dim) in LEARNED:
@@ -89,13 +105,22 @@ def ready(kind: type[Tuner], dim: int, anew: bool = False) -> Tuner:
 
 
 def task_of(dim: int, budget: int, seed: int = 0) -> tuple[Task, Array]:
-    """A target and its truth (dim,), both inside the training range; its arrays are read-only."""
+    """Make a task with its true parameters; its arrays are read-only.
+
+    Args:
+        dim: number of parameters.
+        budget: maximum number of simulations.
+        seed: seed of the true parameters and of the start.
+
+    Returns:
+        The task, and its true parameters (dim,) inside the training range.
+    """
     rng = np.random.default_rng(seed)
-    # Away from the range's ends, where a tuner that clips would find the truth by clipping.
+    # Away from the bounds, where a tuner that clips would hit the truth by clipping.
     truth, start = rng.uniform(0.3, 0.7, size=(2, dim))
     observed = observe(truth[None])[0]
     training = np.array([[LOW] * dim, [HIGH] * dim])
-    # As the harness gives them: who writes to one crashes there too.
+    # Read-only as in the harness, where writing to them fails too.
     for array in (observed, start, training):
         array.setflags(write=False)
     return Task(dim, start, observed, np.ones(2), training, budget, (TIMES.size,)), truth
@@ -109,14 +134,28 @@ def run(
     fails: Callable[[int], bool] = lambda _: False,
     target: int = 0,
 ) -> Trace:
-    """One run; simulation number k fails where `fails(k)`."""
+    """Run a tuner on the toy problem.
+
+    Args:
+        tuner: the tuner.
+        dim: number of parameters.
+        budget: maximum number of simulations.
+        seed: seed of the run.
+        fails: returns whether simulation number k fails.
+        target: seed of the task.
+    """
     given, _ = task_of(dim, budget, target)
     evaluate = evaluation_of(given, fails)
     return drive(tuner, given, evaluate, np.random.default_rng(seed))
 
 
 def evaluation_of(given: Task, fails: Callable[[int], bool] = lambda _: False) -> Evaluate:
-    """What simulates on a target; simulation number k fails where `fails(k)`."""
+    """Make the function that simulates and evaluates points on a task.
+
+    Args:
+        given: the task.
+        fails: returns whether simulation number k fails.
+    """
     simulated = 0
 
     def evaluate(points: Array) -> tuple[Array, Array]:
@@ -127,7 +166,7 @@ def evaluation_of(given: Task, fails: Callable[[int], bool] = lambda _: False) -
             if fails(simulated):
                 lane[:] = np.nan
         losses = np.sqrt(((observations - given.observed) ** 2).mean(axis=(1, 2)))
-        losses[np.isnan(losses)] = np.inf  # what the harness says of a simulation that failed
+        losses[np.isnan(losses)] = np.inf  # as the harness does for a failed simulation
         return observations, losses
 
     return evaluate

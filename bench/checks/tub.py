@@ -1,6 +1,4 @@
-"""The system that effects on levels are checked on, where no registered one has a level: a tub that
-fills by a tap and drains in proportion to its level.
-"""
+"""First-order tank on which effects on levels are checked if no registered system has a level."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ from sims.own import OwnSimulator
 
 
 class Tub(OwnSimulator):
-    """A tub with a tap and a drain, stepped exactly."""
+    """Tank with an inflow and a drain proportional to the level, integrated exactly."""
 
     name = "tub"
     parameters = (Parameter("drain", "1/s", 0.8, (0.1, 2.0)),)
@@ -28,18 +26,29 @@ class Tub(OwnSimulator):
         constants: Mapping[str, float],  # noqa: ARG002
         initial: Mapping[str, float],
     ) -> None:
-        """Start at a level."""
+        """Start at a given level.
+
+        Args:
+            theta: parameters by name.
+            constants: not used.
+            initial: initial states by name.
+        """
         self.drain, self.level = theta["drain"], initial["level"]
 
     def step(self, inputs: Mapping[str, float], seconds: float) -> None:
-        """Go towards the level at which as much comes in as flows out."""
+        """Advance the level; it approaches the value at which inflow and outflow are equal.
+
+        Args:
+            inputs: inputs by name.
+            seconds: length of the step.
+        """
         end = inputs["tap"] / self.drain
         self.level = end + (self.level - end) * math.exp(-self.drain * seconds)
 
     def observe(self) -> dict[str, float]:
-        """The level."""
+        """Return the level."""
         return {"level": self.level}
 
     def put(self, levels: Mapping[str, float]) -> None:
-        """Another level."""
+        """Set the level."""
         self.level = levels["level"]

@@ -1,4 +1,4 @@
-"""Conformance of a tuner; each check takes the tuner's class, and works on its default options."""
+"""Conformance checks of a tuner, with its default options."""
 
 from __future__ import annotations
 
@@ -35,8 +35,10 @@ def _ended_well(kind: type[Tuner], trace: Trace, when: str) -> None:
 
 
 def check_api_is_complete(kind: type[Tuner]) -> None:
-    """A plain name; made without arguments; `tune` is a generator; a learned one has fit, state and
-    restore.
+    """Check that the interface of the tuner is complete.
+
+    It needs a valid name, default options, a generator `tune` and, if it is trained, `fit`, `state`
+    and `restore`.
     """
     look = kind.__name__
     require(bool(_NAME.match(kind.name)), "a name in lower case", repr(kind.name), f"{look}.name")
@@ -46,7 +48,8 @@ def check_api_is_complete(kind: type[Tuner]) -> None:
         raise CheckError(
             f"expected a default for every option; found {error}; see {look}.__init__"
         ) from None
-    # Asked of the object: a `tune` that returns a list would only fail in the harness's loop.
+    # The returned object is tested: a `tune` that returns a list would only fail in the harness's
+    # loop.
     steps = ready(kind, 2).tune(task_of(2, 5)[0], np.random.default_rng(0))
     require(
         inspect.isgenerator(steps),
@@ -69,32 +72,37 @@ def check_api_is_complete(kind: type[Tuner]) -> None:
 
 
 def check_runs_in_one_and_in_ten_dimensions(kind: type[Tuner]) -> None:
-    """It works whatever the number of parameters."""
-    # One is where code for vectors meets a scalar, ten where a grid no longer fits into memory.
+    """Check that the tuner works with one and with ten parameters."""
+    # With one parameter, vector code meets a scalar; with ten, a full grid does not fit into
+    # memory.
     for dim in (1, 10):
         _ended_well(kind, run(ready(kind, dim), dim, 25), f"with {dim} parameters")
 
 
 def check_budget_is_exact(kind: type[Tuner]) -> None:
-    """Budgets 1 to 7 are used, never overshot; ending early is said as a reason."""
+    """Check that budgets of 1 to 7 simulations are used and never exceeded.
+
+    A tuner may end early if it gives a reason.
+    """
     tuner = ready(kind, 2)
-    # Populations are larger than these, so a batch has to be cut.
+    # Populations are larger than these budgets, so a batch must be cut.
     for budget in range(1, 8):
         trace = run(tuner, 2, budget)
         _ended_well(kind, trace, f"with budget {budget}")
-        # Fewer are all right where the tuner says why.
+        # Fewer simulations are correct if the tuner gives a reason.
         used = len(trace.losses)
         exact = used == budget or (trace.status == "converged" and used < budget)
         require(exact, f"{budget} simulations", used, f"{kind.__name__}.tune")
 
 
 def check_arguments_are_not_changed(kind: type[Tuner]) -> None:
-    """The task and the evaluations are the harness's: nothing in them is written to."""
+    """Check that the tuner does not write to the task and the evaluations of the harness."""
     task, _ = task_of(2, 20)
     task = replace(
         task, start=task.start.copy(), observed=task.observed.copy(), training=task.training.copy()
     )
-    # Writable copies: read-only arrays would crash the tuner before it can be found out.
+    # Writable copies: with read-only arrays, the tuner would crash before the check could report
+    # it.
     given = [task.start, task.observed, task.scale, task.training]
     before = [array.copy() for array in given]
     steps = ready(kind, 2).tune(task, np.random.default_rng(0))
@@ -123,12 +131,13 @@ def check_arguments_are_not_changed(kind: type[Tuner]) -> None:
 
 
 def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
-    """Nothing outside 0..1 is proposed or recommended: the harness would move it, and the tuner not
-    know.
+    """Check that all proposals and recommendations are in the unit cube.
+
+    The harness would clip others without informing the tuner.
     """
     asked: list[Array] = []
 
-    # Between tuner and loop, since the loop clips what it records.
+    # A wrapper around the tuner, because the harness's loop clips what it records.
     class Watched(Tuner):
         def tune(self, task: Task, rng: np.random.Generator) -> Steps:
             steps = ready(kind, 2).tune(task, rng)
@@ -150,8 +159,11 @@ def check_proposals_stay_in_the_unit_cube(kind: type[Tuner]) -> None:
 
 
 def check_same_seed_gives_the_same_run(kind: type[Tuner]) -> None:
-    """Two runs with one seed agree bit for bit, also when global generators stand elsewhere."""
-    # One instance, two runs: what a run leaves behind must not matter either.
+    """Check that two runs with the same seed agree bit for bit.
+
+    The global random generators have different states in the two runs.
+    """
+    # Two runs of one instance, because state left by a run must not matter either.
     tuner = ready(kind, 2)
     first = run(tuner, 2, 25, seed=3)
     saved = np.random.get_state()  # noqa: NPY002
@@ -167,7 +179,7 @@ def check_same_seed_gives_the_same_run(kind: type[Tuner]) -> None:
 
 
 def check_runs_do_not_touch_each_other(kind: type[Tuner]) -> None:
-    """A run on an instance that has run before equals one on a fresh instance."""
+    """Check that a run on a used instance equals one on a fresh instance."""
     used = ready(kind, 2)
     run(used, 2, 15, seed=1)
     again, fresh = run(used, 2, 15, seed=2), run(ready(kind, 2), 2, 15, seed=2)
@@ -181,14 +193,14 @@ def check_runs_do_not_touch_each_other(kind: type[Tuner]) -> None:
 
 
 def check_global_random_state_is_left_alone(kind: type[Tuner]) -> None:
-    """Neither training nor tuning draws from or seeds a global generator."""
-    run(ready(kind, 2), 2, 3)  # import what it imports lazily
+    """Check that neither training nor tuning uses or seeds a global random generator."""
+    run(ready(kind, 2), 2, 3)  # performs lazy imports
     with global_random_state_untouched(f"{kind.__name__}.fit and .tune: use rng"):
         run(ready(kind, 2, anew=True), 2, 15)
 
 
 def check_stochastic_is_declared(kind: type[Tuner]) -> NotApplicable | None:
-    """A tuner that calls itself not stochastic gives the same run for every seed."""
+    """Check that a tuner declared as not stochastic gives the same run for every seed."""
     if kind.stochastic:
         return NotApplicable("it says that it uses chance")
     tuner = ready(kind, 2)
@@ -199,23 +211,27 @@ def check_stochastic_is_declared(kind: type[Tuner]) -> NotApplicable | None:
 
 
 def check_failed_simulations_are_survived(kind: type[Tuner]) -> None:
-    """Survive simulations that give NaN and an infinite loss: the first one, some, or all."""
+    """Check that the tuner tolerates simulations that give NaN and an infinite loss.
+
+    The first simulation, every third one, or all of them fail.
+    """
     tuner = ready(kind, 2)
-    # The first is where a method begins from; all is where nothing can be fitted.
+    # Methods start from the first simulation; if all fail, nothing can be fitted.
     for fails, when in (
         (lambda k: k == 1, "when the first simulation fails"),
         (lambda k: k % 3 == 0, "when every third simulation fails"),
         (lambda _: True, "when every simulation fails"),
     ):
         trace = run(tuner, 2, 15, fails=fails)
-        # A run without one finite loss is `diverged`, however the tuner ends it.
+        # A run without a finite loss has the status `diverged`, however the tuner ends it.
         if trace.status != "diverged" or np.isfinite(trace.losses).any():
             _ended_well(kind, trace, when)
 
 
 def check_easy_problem_is_improved(kind: type[Tuner]) -> None:
-    """On a smooth, identifiable problem the recommendation after 60 simulations is better than the
-    start.
+    """Check that the tuner improves the start on a smooth, identifiable problem.
+
+    The error of the recommendation after 60 simulations must be below half of the start's.
     """
     trace = run(ready(kind, 2), 2, 60)
     task, truth = task_of(2, 60)
@@ -231,15 +247,14 @@ def check_easy_problem_is_improved(kind: type[Tuner]) -> None:
 
 
 _LOOKS = (6, 12, 24)
-"""Targets after which `check_beats_random_search` looks; each look may be wrong in a third of 5 %.
-"""
+"""Numbers of targets after which random search is compared, each at a third of 5 %."""
 
 
 def check_beats_random_search(kind: type[Tuner]) -> None:
-    """On targets of the easy problem its errors after 30 simulations are below random search's.
+    """Check that errors after 30 simulations on the easy problem are below those of random search.
 
-    One-sided Wilcoxon signed-rank tests of the paired log errors (scipy) at 5 % over at most three
-    looks, so that a clear case is soon done.
+    The test is a one-sided Wilcoxon signed-rank test of the paired log errors (scipy), at 5 % over
+    at most three looks, so that a clear case is decided early.
     """
     from scipy.stats import wilcoxon
 
@@ -248,9 +263,9 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
     for look in _LOOKS:
         logs += [_final_logs((tuner, chance), target) for target in range(len(logs), look)]
         mine, random = np.array(logs).T
-        differ = (mine != random).any()  # the test has no answer where nothing differs
+        differ = (mine != random).any()  # the test is undefined without a difference
         p = float(wilcoxon(mine, random, alternative="less").pvalue) if differ else 1.0
-        # Bonferroni: three looks at 5 % in all.
+        # Bonferroni correction: three looks at 5 % in total.
         if p < 0.05 / len(_LOOKS):
             return
     medians = [f"{np.exp(np.median(logs)):.2g}" for logs in (mine, random)]
@@ -260,7 +275,7 @@ def check_beats_random_search(kind: type[Tuner]) -> None:
 
 
 def _final_logs(subjects: tuple[Tuner, ...], target: int) -> Array:
-    """Logarithms of the errors with which these tuners end on one target."""
+    """Compute the logarithms of the final errors of several tuners on one target."""
     _, truth = task_of(2, 30, target)
     traces = [run(tuner, 2, 30, seed=target, target=target) for tuner in subjects]
     return np.log(
@@ -269,10 +284,10 @@ def _final_logs(subjects: tuple[Tuner, ...], target: int) -> Array:
 
 
 class _Chance(Tuner):
-    """What every tuner should beat."""
+    """Random search, the baseline that every tuner should beat."""
 
     def tune(self, task: Task, rng: np.random.Generator) -> Steps:
-        """Uniform points."""
+        """Propose uniformly distributed points."""
         while True:
             yield rng.uniform(size=(1, task.dim))
 
@@ -280,8 +295,12 @@ class _Chance(Tuner):
 def run_digests(
     kind: type[Tuner], seeds: tuple[int, ...], learned: dict[str, Array] | None = None
 ) -> list[str]:
-    """Hashes of a run with each seed, for comparison between processes; trains unless it is given
-    what was learned.
+    """Compute a hash of a run for each seed, for comparison between processes.
+
+    Args:
+        kind: class of the tuner.
+        seeds: seeds of the runs.
+        learned: trained state; None to train if necessary.
     """
     if learned:
         LEARNED[kind, 2] = learned
@@ -293,11 +312,12 @@ def run_digests(
 
 
 def check_same_run_in_other_processes(kind: type[Tuner]) -> None:
-    """The same seeds give the same bits here, in another process, and in 1 and in 4 workers."""
+    """Check that runs agree bit for bit here, in another process, and in 1 and 4 workers."""
     look = f"{kind.__name__}: what depends on the process, e.g. hash(), the clock, threads"
     seeds = (0, 1, 2, 3)
     here = run_digests(kind, seeds)
-    # One worker trains for itself, four are given what was learned here: both must agree with here.
+    # One worker trains by itself, four get the state trained here; all must agree with this
+    # process.
     for workers, learned in ((1, None), (4, LEARNED.get((kind, 2)))):
         there = elsewhere(run_digests, [(kind, (seed,), learned) for seed in seeds], workers, kind)
         ended = [str(digest) for digest in there if isinstance(digest, Exception)]
@@ -307,7 +327,10 @@ def check_same_run_in_other_processes(kind: type[Tuner]) -> None:
 
 
 def check_what_was_learned_can_be_stored(kind: type[Tuner]) -> NotApplicable | None:
-    """`state` and `restore` round-trip through plain arrays; those of another tuner are refused."""
+    """Check that `state` and `restore` round-trip, and that the state of another tuner is rejected.
+
+    The state must consist of plain numeric arrays.
+    """
     if not kind.learned:
         return NotApplicable("it does not learn")
     tuner, other = ready(kind, 2), kind()
@@ -315,11 +338,12 @@ def check_what_was_learned_can_be_stored(kind: type[Tuner]) -> NotApplicable | N
     plain = all(isinstance(a, np.ndarray) and a.dtype.kind in "fiu" for a in state.values())
     found = {name: type(array) for name, array in state.items()}
     require(bool(state) and plain, "plain numeric arrays", found, f"{kind.__name__}.state")
-    # A run shows more than the arrays: scales and settings may be kept beside them.
+    # A run is compared and not only the arrays, because scales and settings may be stored
+    # elsewhere.
     other.restore(state)
     same = same_bits(run(tuner, 2, 5).proposals, run(other, 2, 5).proposals)
     require(same, "the same run after restore", "another one", f"{kind.__name__}.restore")
-    # Weights of another version or another tuner must not be taken for one's own.
+    # Weights of another version or another tuner must not be accepted.
     try:
         kind().restore({"weights": np.zeros(3)})
     except ValueError:
@@ -330,7 +354,7 @@ def check_what_was_learned_can_be_stored(kind: type[Tuner]) -> NotApplicable | N
 
 
 def check_instances_can_be_sent_to_workers(kind: type[Tuner]) -> None:
-    """An instance and its options survive pickling."""
+    """Check that an instance with its options can be pickled."""
     try:
         pickle.loads(pickle.dumps(kind()))
     except Exception as error:
@@ -378,4 +402,4 @@ TUNER_NEEDS: Mapping[Check, tuple[Check, ...]] = {
     check_same_run_in_other_processes: (_REPEATS,),
     check_same_run_when_sealed: (check_same_run_in_other_processes,),
 }
-"""Checks that mean nothing where another one fails."""
+"""For each check, the checks that must pass for it to be meaningful."""

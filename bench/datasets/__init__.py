@@ -1,3 +1,1 @@
-"""Public data sets that experiments of the project need: which there are, where they lie, and how
-`simgap download` gets them.
-"""
+"""Public data sets that experiments need: catalogue, folders on this machine, and download."""

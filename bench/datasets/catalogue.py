@@ -1,4 +1,4 @@
-"""The data sets of datasets.toml, and where each lies on this machine."""
+"""Catalogue of the data sets in datasets.toml, and their folders on this machine."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from sims.base import unknown
 from sims.user_toml import tomllib
 
 FOLDER_VARIABLES = {"recording": "SIMGAP_DATA", "robot": "SIMGAP_ROBOTS"}
-"""By kind of data set, the environment variable that names the folder of such data sets."""
+"""Environment variables with the folder of data sets, by kind of data set."""
 
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A file of a data set in its public repository.
+    """File of a data set in its public repository.
 
     Attributes:
-        path: in the repository.
-        bytes: its size.
-        sha256: its digest, hexadecimal.
-        write_as: name under which it is written, where it is written under another.
+        path: path in the repository.
+        bytes: size.
+        sha256: SHA-256, hexadecimal.
+        write_as: file name in the data set's folder, if it differs from that in the repository.
     """
 
     path: str
@@ -34,26 +34,26 @@ class SourceFile:
 
     @property
     def name(self) -> str:
-        """Name of the file in the data set's folder, where it is written there as it is."""
+        """File name in the data set's folder, for files that are written without conversion."""
         return self.write_as or PurePosixPath(self.path).name
 
 
 @dataclass(frozen=True)
 class DataSet:
-    """A public data set.
+    """Public data set.
 
     Attributes:
-        name: of the data set, and of its folder.
-        title: one line on what it holds.
+        name: name of the data set, and of its folder.
+        title: one line on its content.
         kind: "recording" or "robot".
         licence: SPDX identifier of the licence under which its authors published it.
         repository: address of its GitHub repository.
-        commit: of the repository, 40 hexadecimal digits.
+        commit: commit of the repository, 40 hexadecimal digits.
         cite: authors and paper.
         provides: names of the files that commands read from its folder.
-        files: what is fetched.
-        conversion: key of `bench.datasets.conversions.CONVERSIONS`; empty where the files are
-            used as they are.
+        files: files to download.
+        conversion: key of `bench.datasets.conversions.CONVERSIONS`; empty if the files are used
+            without conversion.
     """
 
     name: str
@@ -69,33 +69,33 @@ class DataSet:
 
     @property
     def bytes(self) -> int:
-        """Bytes that are downloaded."""
+        """Number of bytes to download."""
         return sum(file.bytes for file in self.files)
 
     @property
     def size(self) -> str:
-        """Size of the download in words, e.g. ``1.0 MB``."""
+        """Size of the download as text, for example ``1.0 MB``."""
         kilobytes = self.bytes / 1e3
         return f"{kilobytes / 1e3:.1f} MB" if kilobytes >= 1e3 else f"{kilobytes:.0f} kB"
 
     @property
     def base_url(self) -> str:
-        """Address below which its files are served."""
+        """Base address of its files."""
         owner_and_name = self.repository.removeprefix("https://github.com/")
         return f"https://raw.githubusercontent.com/{owner_and_name}/{self.commit}"
 
     @property
     def command(self) -> str:
-        """The command that gets it."""
+        """Command that downloads the data set."""
         return f"simgap download {self.name}"
 
     @property
     def advice(self) -> str:
-        """What a message says where the data set is needed and missing."""
+        """Text of a message when the data set is needed and missing."""
         return f"needs the data set {self.name} ({self.size}, {self.licence}): run `{self.command}`"
 
     def folder(self) -> Path | None:
-        """The folder in which it lies on this machine; None where it does not."""
+        """Return the folder of the data set on this machine, or None if it is not there."""
         for parent in search_folders(self.kind):
             if all((parent / self.name / file).is_file() for file in self.provides):
                 return parent / self.name
@@ -103,14 +103,18 @@ class DataSet:
 
 
 def user_folder() -> Path:
-    """The folder of this user's data sets: simgap/ in $XDG_DATA_HOME, else in ~/.local/share."""
+    """Return the folder of this user's data sets.
+
+    It is simgap/ in $XDG_DATA_HOME, or else in ~/.local/share.
+    """
     base = os.environ.get("XDG_DATA_HOME")
     return (Path(base) if base else Path.home() / ".local" / "share") / "simgap"
 
 
 def search_folders(kind: str) -> Iterator[Path]:
-    """The folders in which data sets of a kind are looked for, in this order: the one that the
-    environment names, then the user's.
+    """Yield the folders in which data sets of a kind are searched, in this order.
+
+    They are the one in the environment variable, if it is set, and the user's.
     """
     given = os.environ.get(FOLDER_VARIABLES[kind])
     if given:
@@ -119,23 +123,31 @@ def search_folders(kind: str) -> Iterator[Path]:
 
 
 def find(kind: str, path: str) -> Path | None:
-    """The file `path` below the first folder of a kind that holds it; None where none does."""
+    """Find the file `path` below the folders of a kind of data sets.
+
+    Args:
+        kind: kind of data set.
+        path: path below the folder.
+
+    Returns:
+        The first file found, or None.
+    """
     for folder in search_folders(kind):
         try:
             if (folder / path).is_file():
                 return folder / path
-        except (OSError, ValueError):  # no file could have such a name
+        except (OSError, ValueError):  # a name that no file can have
             return None
     return None
 
 
 def names() -> list[str]:
-    """Names of all data sets."""
+    """List the names of all data sets."""
     return list(_catalogue())
 
 
 def get(name: str) -> DataSet:
-    """The data set of a name.
+    """Return the data set of a name.
 
     Raises:
         InputError: no data set has this name; the message lists the known names.
@@ -146,8 +158,11 @@ def get(name: str) -> DataSet:
 
 
 def providing(kind: str, path: str) -> DataSet | None:
-    """The data set of a kind that provides the file `path` of an experiment; None where none
-    does.
+    """Return the data set that provides a file of an experiment, or None.
+
+    Args:
+        kind: kind of data set.
+        path: path of the file, with the name of the data set as its folder.
     """
     folder, _, file = path.replace("\\", "/").rpartition("/")
     found = _catalogue().get(folder)

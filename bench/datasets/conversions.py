@@ -11,18 +11,18 @@ from sims.base import InputError
 from sims.files import Content
 
 Conversion = Callable[[Mapping[str, bytes]], dict[str, Content]]
-"""Takes the contents of a data set's files by name; returns the files to write by name."""
+"""Function from the contents of a data set's files, by name, to the files to write, by name."""
 
 _PERIOD_MS = 1
-"""Sample period of the published file [ms]."""
+"""Sample period of the published file, ms."""
 _EVERY = 5
-"""Each fifth sample is kept: 200 Hz."""
+"""Decimation factor: every fifth sample is kept, which gives 200 Hz."""
 _SAMPLES = 1000
-"""Samples of a run: 5 s at 200 Hz."""
+"""Number of samples of a run: 5 s at 200 Hz."""
 _HELD_OUT_FROM = 7
-"""Number of the first run that is held out."""
+"""Number of the first held-out run."""
 _DECIMALS = 6
-"""Decimals of the published angles and rates that are kept; an encoder step is 1e-3 rad."""
+"""Number of decimals to which angles and rates are rounded; an encoder step is 1e-3 rad."""
 
 _FREE_SWING = """system = "pendulum"
 title = "Single pendulum, free swing, encoder"
@@ -41,14 +41,14 @@ gravity = 9.81    # m/s^2
 
 
 def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
-    """Convert the single pendulum's free swing into a recording of runs of 5 s.
+    """Convert the free swing of the single pendulum to a recording with runs of 5 s.
 
-    The MATLAB file holds one swing at 1 ms, cut into pieces: ``Y_id`` and ``Y_vad`` are cell arrays
-    of (2, T) angles (pi is hanging) and rates. The pieces are joined, every fifth sample is kept
-    and the angle is taken from hanging; runs from number 7 on are held out.
+    The MATLAB file holds one swing at 1 ms, divided into pieces: ``Y_id`` and ``Y_vad`` are cell
+    arrays of (2, T) angles (pi is hanging) and rates. The pieces are joined, every fifth sample is
+    kept, and the angle is measured from hanging. Runs from number 7 on are held out.
 
     Raises:
-        InputError: the file does not hold that.
+        InputError: the file does not have this form.
     """
     (name,) = [name for name in files if name.endswith(".mat")]
     swing = _joined_pieces(name, files[name])[:, ::_EVERY]
@@ -69,14 +69,14 @@ def free_swing(files: Mapping[str, bytes]) -> dict[str, Content]:
 
 
 def _joined_pieces(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """(2, T) angles and rates of all pieces of a MATLAB file, in their order."""
+    """Join the angles and rates (2, T) of all pieces of a MATLAB file, in their order."""
     from scipy.io import loadmat
 
     try:
         arrays = loadmat(io.BytesIO(content))  # type: ignore[arg-type]  # the stubs know no streams
         pieces = [piece for key in ("Y_id", "Y_vad") for piece in arrays[key].ravel()]
         joined = np.concatenate([np.asarray(piece, float) for piece in pieces], axis=1)
-    except Exception as error:  # the reader raises what it meets in a damaged file
+    except Exception as error:  # the reader raises various errors for a damaged file
         what = f"{type(error).__name__}: {error}"
         wanted = "a MATLAB file with cell arrays Y_id and Y_vad of (2, T) numbers"
         raise InputError(f"{name}: expected {wanted} ({what})") from None
@@ -86,4 +86,4 @@ def _joined_pieces(name: str, content: bytes) -> np.ndarray[tuple[int, int], np.
 
 
 CONVERSIONS: Mapping[str, Conversion] = {"free_swing": free_swing}
-"""By name, as datasets.toml has it."""
+"""Conversions by their names in datasets.toml."""

@@ -1,5 +1,6 @@
-"""Fetch a data set, check size and SHA-256 of every file, convert it and write its folder, all or
-nothing.
+"""Download a data set, check size and SHA-256 of every file, convert it, and write its folder.
+
+Either the whole folder is written or nothing.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from sims.base import InputError
 from sims.files import Content, fresh_folder
 
 _TIMEOUT = 30.0
-"""Seconds after which a server that sends nothing is given up."""
+"""Timeout for a server that sends no data, seconds."""
 _BLOCK = 1 << 16
-"""Bytes that are read at a time."""
+"""Number of bytes that are read at a time."""
 
 Advance = Callable[[int], None]
-"""Called with the number of bytes that have come."""
+"""Callback with the number of bytes received."""
 
 
 def download(
@@ -32,19 +33,19 @@ def download(
     """Write a data set into the folder NAME below `folder`.
 
     Args:
-        data_set: which.
-        folder: where data sets of its kind lie; made where it is missing.
-        source: where to take the files from instead of their public repository: a folder that
-            holds them, such as a clone at the data set's commit, or an address that serves the
-            repository's files.
-        advance: called as bytes come.
+        data_set: the data set.
+        folder: parent folder of the data sets of this kind; created if it does not exist.
+        source: source of the files instead of their public repository: a folder that contains them,
+            such as a clone at the data set's commit, or an address that serves the repository's
+            files; empty for the public repository.
+        advance: called when bytes are received.
 
     Returns:
         The data set's folder.
 
     Raises:
-        InputError: a file cannot be had or is not the one that was published, or the folder cannot
-            be written. Nothing is written then.
+        InputError: a file cannot be downloaded or is not the published one, or the folder cannot be
+            written. Nothing is written then.
     """
     target = folder / data_set.name
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -68,7 +69,7 @@ def download(
 def _fetched(
     data_set: DataSet, file: SourceFile, source: str, advance: Advance
 ) -> tuple[str, bytes]:
-    """Where a file was taken from, and its content."""
+    """Fetch a file, and return its source and content."""
     if source and "://" not in source:
         return _read(data_set, file, Path(source), advance)
     if source and not source.startswith(("http://", "https://")):
@@ -78,7 +79,7 @@ def _fetched(
 
 
 def _read(data_set: DataSet, file: SourceFile, folder: Path, advance: Advance) -> tuple[str, bytes]:
-    """A file of a folder that holds a clone, or the files side by side."""
+    """Read a file from a folder that contains a clone, or the files without subfolders."""
     if not folder.is_dir():
         raise InputError(f"--from {folder}: no such folder")
     for path in (folder / file.path, folder / Path(file.path).name, folder / file.name):
@@ -95,7 +96,7 @@ def _read(data_set: DataSet, file: SourceFile, folder: Path, advance: Advance) -
 
 
 def _received(url: str, data_set: DataSet, file: SourceFile, advance: Advance) -> bytes:
-    """The content of an address; one byte more than expected where it is longer."""
+    """Download the content of an address; one byte more than expected if it is longer."""
     remedy = f"get it elsewhere and give its folder with `{data_set.command} --from FOLDER`"
     request = urllib.request.Request(url, headers={"User-Agent": f"simgap/{__version__}"})
     content = b""
@@ -117,7 +118,11 @@ def _received(url: str, data_set: DataSet, file: SourceFile, advance: Advance) -
 
 
 def _checked(file: SourceFile, where: str, content: bytes) -> bytes:
-    """The content, if it is the published one."""
+    """Return the content if it is the published one.
+
+    Raises:
+        InputError: size or SHA-256 differ.
+    """
     found = len(content)
     if found > file.bytes:
         raise InputError(f"{where}: expected {file.bytes} bytes, found more; nothing is written")
@@ -132,7 +137,7 @@ def _checked(file: SourceFile, where: str, content: bytes) -> bytes:
 
 
 def _provenance(data_set: DataSet) -> str:
-    """What stands beside the files: where they are from and under which licence."""
+    """Format SOURCE.txt: source, citation, licence and hashes of the files."""
     lines = [
         data_set.title,
         f"Source: {data_set.repository}, commit {data_set.commit}",

@@ -1,1 +1,1 @@
-"""Diagnosers that come with simgap, one a module; see `bench.diagnoser`."""
+"""Built-in diagnosers, one per module; see `bench.diagnoser`."""

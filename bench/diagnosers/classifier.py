@@ -1,11 +1,10 @@
-"""A learned classifier: a network that has seen simulated recordings with every effect of the
-library, and names the class of a new one.
+"""Neural classifier, trained on simulated recordings with every effect of the library.
 
-Amortised inference, as tuners that learn have it (A. Allevato et al., TuneNet, CoRL 2019): all
-simulations are spent before a recording is seen, and an answer costs a base fit alone. The network
-sees of each run the residual of the base fit in units of the noise, with the motion and the inputs
-beside it, on a fixed grid; convolutions read a run, the mean over runs makes their order and number
-irrelevant. Classes are the library's effects, and nothing.
+This is amortised inference, as in learned tuners (A. Allevato et al., TuneNet, CoRL 2019): all
+simulations are made before a recording is available, and an answer costs only a base fit. The input
+of the network is, for each run, the residual of the base fit in units of the noise with the motion
+and the inputs, on a fixed grid. Convolutions process a run; the mean over runs makes their order
+and number irrelevant. The classes are the effects of the library, and no effect.
 """
 
 from __future__ import annotations
@@ -30,45 +29,45 @@ from sims.simulated import Simulated, effect_parameters
 from sims.tally import SpentError
 
 POINTS = 64
-"""Of the grid over a run."""
+"""Number of grid points over a run."""
 WIDTH = 48
-"""Of the network's layers."""
+"""Number of channels of the network's layers."""
 EPOCHS = 60
-"""Through all examples."""
+"""Number of training epochs."""
 BATCH = 64
-"""Recordings a step."""
+"""Number of recordings per training step."""
 CLEAN = 0.25
-"""Share of examples with nothing hidden."""
+"""Fraction of examples without an effect."""
 SHOWN = (1.15, 20.0)
-"""RMS of the base fit's residual in units of the noise of examples that are learned from."""
+"""Range of the residual RMS of training examples, in units of the noise."""
 FEWEST = 8
-"""Examples without which nothing is learned."""
+"""Minimum number of training examples; with fewer, nothing is trained."""
 ALARM = 0.05
-"""Probability of nothing below which something is missing."""
+"""Probability of no effect below which something is missing."""
 SHARE = 0.4
-"""Of the most probable effect's probability, from which another one stands beside it."""
+"""Minimum probability of an alternative, as a fraction of that of the most probable effect."""
 SURE = 0.25
-"""Probability of all that is named below which it is unknown."""
+"""Minimum total probability of the named effects; below it, the verdict is unknown."""
 HELD_OUT = 0.15
-"""Share of the examples by which the epoch is chosen."""
+"""Fraction of the examples used for validation, by which the epoch is selected."""
 _CLIPPED = 30.0
-"""Noises beyond which a residual is one."""
+"""Absolute value at which residuals are clipped, in units of the noise."""
 _NOISES = {"point": (2e-3, 2e-2), "linear": (1e-3, 1e-2), "rotary": (1e-3, 1e-2)}
-"""Of the first channel, by kind of system, SI units."""
+"""Noise range of the first channel by kind of system, SI units."""
 
 
 class Classifier(Diagnoser):
-    """A network trained on simulated effects; it names the most probable ones (torch)."""
+    """Neural network trained on simulated effects; it names the most probable ones (torch)."""
 
     name = "classifier"
     learned: ClassVar[bool] = True
 
     def cannot(self, kind: type[Simulated]) -> str:
-        """It learns a system before anybody shows it a recording, or a model file."""
+        """Reject robots: the training precedes the case, so their model file is not available."""
         return "nobody knows a robot's file before it is asked" if kind.has_model else ""
 
     def train(self, lesson: Lesson) -> Mapping[str, Array]:
-        """Simulate recordings until the budget is spent, and fit the network."""
+        """Simulate recordings until the budget is used up, and train the network."""
         classes = ["", *sorted(lesson.library)]
         images, labels = [], []
         for number in count():
@@ -78,7 +77,7 @@ class Classifier(Diagnoser):
             except SpentError:
                 break
             except InputError:
-                continue  # a wish that cannot be simulated
+                continue  # a simulation specification that is not possible
             if image is not None:
                 images.append(image)
                 labels.append(classes.index(name))
@@ -87,13 +86,13 @@ class Classifier(Diagnoser):
         return _fitted(images, np.array(labels), len(classes), int(lesson.rng.integers(1 << 31)))
 
     def diagnose(self, case: Case) -> Answer:
-        """What the network takes it for."""
+        """Name the most probable effects."""
         if not case.learned:
             return Answer("unidentifiable")
         classes = ["", *sorted(library_of(case.kind.system))]
         image, _ = _image(case.kind, case.recording)
         odds = _asked(case.learned, image, len(classes))
-        # What the recording's signals cannot show is not asked.
+        # Effects that the recorded signals cannot show are excluded.
         possible = np.array([not name or name in case.library for name in classes])
         odds = np.where(possible, odds, 0.0)
         odds = odds / odds.sum()
@@ -110,10 +109,18 @@ class Classifier(Diagnoser):
 
 
 def _example(lesson: Lesson, name: str, number: int) -> Array | None:
-    """One simulated recording with an effect, as the network sees it; None where it does not show.
+    """Simulate one recording with an effect, as input of the network.
+
+    Args:
+        lesson: the training task.
+        name: name of the effect; empty for none.
+        number: number of the example, added to the random seed.
+
+    Returns:
+        The input of the network; None if the residual is outside the range `SHOWN`.
 
     Raises:
-        SpentError: the budget is spent.
+        SpentError: the budget is used up.
     """
     rng, kind = lesson.rng, lesson.kind
     system = kind.system
@@ -153,7 +160,7 @@ def _example(lesson: Lesson, name: str, number: int) -> Array | None:
 
 
 def _coefficients(lesson: Lesson, name: str) -> tuple[float, ...]:
-    """Sizes drawn over decades of what is plausible, shapes evenly on their range."""
+    """Draw coefficients of an effect: sizes log-uniformly, shape parameters uniformly."""
     rng = lesson.rng
     values = []
     for place, parameter in enumerate(effect_parameters(lesson.library[name], lesson.kind.system)):
@@ -161,7 +168,7 @@ def _coefficients(lesson: Lesson, name: str) -> tuple[float, ...]:
         if low > 0:
             values.append(float(np.exp(rng.uniform(np.log(low), np.log(high)))))
             continue
-        # What scales an effect may be small; what only modifies it is not.
+        # The first coefficient scales the effect and may be small; the others only modify it.
         share = 10 ** rng.uniform(-2.5, 0.0) if place == 0 else rng.uniform(0.1, 1.0)
         sign = rng.choice([-1.0, 1.0]) if low < 0 else 1.0
         values.append(float(sign * share * high))
@@ -169,8 +176,11 @@ def _coefficients(lesson: Lesson, name: str) -> tuple[float, ...]:
 
 
 def _image(kind: type[Simulated], recording: Recording) -> tuple[Array, float]:
-    """(R, F, POINTS) of the runs: residuals in noises, motion, inputs, whether a channel is there;
-    and the RMS of the residuals.
+    """Compute the network's input from a recording.
+
+    Returns:
+        Residuals in units of the noise, motion, inputs, and masks of the present channels, (R, F,
+        POINTS); and the RMS of the residuals.
     """
     with closing(World(kind, recording, list(recording.runs), "batch", candidates=())) as world:
         noise = Noise(noise_floor(world, recording).sigma, np.zeros(len(world.channels)))
@@ -204,12 +214,12 @@ def _image(kind: type[Simulated], recording: Recording) -> tuple[Array, float]:
 
 
 def _network(features: int, classes: int) -> Any:
-    """Convolutions over a run, the mean over runs, and a decision."""
+    """Make the network: convolutions over a run, mean over runs, and dense layers."""
     import torch
     from torch import nn
 
     class Network(nn.Module):
-        """See this module."""
+        """Network described in this module."""
 
         def __init__(self) -> None:
             super().__init__()
@@ -231,7 +241,15 @@ def _network(features: int, classes: int) -> Any:
             )
 
         def forward(self, images: Any, weights: Any) -> Any:
-            """Log odds (B, classes) of images (B, R, F, POINTS), runs weighed by (B, R)."""
+            """Compute class scores.
+
+            Args:
+                images: inputs, (B, R, F, POINTS).
+                weights: 1 for runs that exist, otherwise 0, (B, R).
+
+            Returns:
+                Logits, (B, classes).
+            """
             batch, runs = images.shape[:2]
             read = self.run(images.flatten(0, 1))
             read = torch.cat([read.mean(dim=2), read.amax(dim=2)], dim=1)
@@ -242,7 +260,7 @@ def _network(features: int, classes: int) -> Any:
 
 
 def _stacked(images: Sequence[Array]) -> tuple[Any, Any]:
-    """Images of different numbers of runs as one tensor, and which runs there are."""
+    """Stack inputs with different numbers of runs into one tensor, with a mask of the runs."""
     import torch
 
     most = max(len(image) for image in images)
@@ -255,7 +273,7 @@ def _stacked(images: Sequence[Array]) -> tuple[Any, Any]:
 
 
 def _fitted(images: Sequence[Array], labels: Array, classes: int, seed: int) -> dict[str, Array]:
-    """The network's weights, those of the epoch that did best on examples that it did not see."""
+    """Train the network, and return the weights of the epoch with the best validation loss."""
     import torch
     from torch.nn.functional import cross_entropy
 
@@ -287,10 +305,10 @@ def _fitted(images: Sequence[Array], labels: Array, classes: int, seed: int) -> 
 
 
 def _asked(learned: Mapping[str, Array], image: Array, classes: int) -> Array:
-    """(classes,) probabilities."""
+    """Compute the class probabilities, (classes,)."""
     import torch
 
-    # weights drawn at random for a moment, and from nobody's generator
+    # Creating the network draws random weights; the global random generator is restored.
     with torch.random.fork_rng(devices=[]):
         network = _network(image.shape[1], classes)
     network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in learned.items()})

@@ -1,10 +1,9 @@
-"""A Gaussian process over what the base model leaves: it says that something is missing, and never
-what.
+"""Gaussian-process discrepancy model: detects that something is missing, names no cause.
 
 The discrepancy is a function of time, state and input with a Gaussian process as its prior (M. C.
 Kennedy, A. O'Hagan, J. R. Stat. Soc. B 63, 425, 2001, doi:10.1111/1467-9868.00294), here of
-accelerations, as residual models of robots have it. It is fitted on some runs; where it predicts
-the others better than nothing does, something is missing.
+accelerations, as in residual models of robots. It is fitted on the runs for fitting. If it predicts
+the residual of the held-out runs better than zero does, something is missing.
 """
 
 from __future__ import annotations
@@ -18,20 +17,20 @@ from bench.diagnoser import Answer, Case, Diagnoser
 from bench.diagnosers.evidence import Evidence, Rows
 
 LEVEL = 0.01
-"""Chance of a false alarm that is wanted."""
+"""False-alarm probability."""
 FITTED = 160
-"""Samples that the process is conditioned on."""
+"""Maximum number of samples on which the process is conditioned."""
 BLOCKS = 12
-"""Parts of the held-out runs whose gains are compared."""
+"""Number of blocks of the held-out runs whose improvements are compared."""
 
 
 class Discrepancy(Diagnoser):
-    """A Gaussian process over the accelerations that are left: the alarm alone, no name."""
+    """Gaussian process of the acceleration residuals: detects a discrepancy, names no cause."""
 
     name = "gp"
 
     def diagnose(self, case: Case) -> Answer:
-        """Unknown where runs that are held out are predicted better with it."""
+        """Return "unknown" if the process predicts held-out runs better than zero does."""
         evidence = Evidence(case)
         try:
             rows = evidence.accelerations()
@@ -42,7 +41,7 @@ class Discrepancy(Diagnoser):
 
 
 def _chance(fitted: Rows, held_out: Rows, rng: np.random.Generator) -> float:
-    """Probability of the gain on held-out runs if the process had nothing to say."""
+    """Compute the p-value of the improvement on held-out runs: one-sided t-test over blocks."""
     from scipy.stats import t as students
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel

@@ -1,20 +1,20 @@
-"""What several diagnosers look at: the base model fitted to a recording, what it leaves, and what
-each effect of the library would change about it, along the trajectory or as an acceleration.
+"""Base-model residuals and directions of the effects, shared by several diagnosers.
 
-With y the recorded runs and y₀ those of the fitted base model, the residual r = y - y₀ is to first
-order a sum of what parameters, initial states (J) and missing effects (D) change,
+The base model is fitted to a recording. With y the recorded runs and y₀ those of the fitted base
+model, the residual r = y - y₀ is to first order a sum of changes by parameters and initial states
+(J) and by missing effects (D),
 
     r = J δ + D c + noise                                                                      (1)
 
-An effect's direction D is taken from the simulator (`bench.gap.causes.candidates`), and so holds
-for effects of forces, inputs, sensors and impacts alike. What a regression of accelerations sees of
-it is (1) under a linear operator: the second derivative of a position, the first of a rate, less
-what the motion's own stiffness A and damping B make of a displacement,
+The direction D of an effect is computed with the simulator (`bench.gap.causes.candidates`), so it
+exists for effects of forces, inputs, sensors and impacts alike. A regression of accelerations
+applies a linear operator to (1): the second derivative of a position, or the first derivative of a
+rate, minus the effect of a displacement through the stiffness A and damping B of the motion,
 
     L r = r'' - A r - B r'                                                                     (2)
 
 with derivatives by local polynomials (A. Savitzky, M. J. E. Golay, Anal. Chem. 36, 1627, 1964).
-Both sides pass the same filter, which thus biases nothing. Samples near an impact are left out.
+Both sides pass the same filter, so the filter causes no bias. Samples near an impact are excluded.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ from sims.base import Array
 from sims.system import Moment
 
 WINDOW = 0.2
-"""Seconds of the local polynomials."""
+"""Length of the window of a local polynomial, seconds."""
 LEAST_WINDOW = 7
-"""Samples of them at least."""
+"""Minimum number of samples in the window of a local polynomial."""
 DEGREE = 3
-"""Of the polynomials."""
+"""Degree of the local polynomials."""
 NUDGE = 1e-5
-"""Of a coordinate and of a rate, SI units, for A and B of (2)."""
+"""Finite-difference step of a coordinate and of a rate for A and B in (2), SI units."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of (1): one grid point of an effect, all of its directions together.
+    """Column of (1): all directions of an effect at one point of its parameter grid.
 
     Attributes:
-        effect: its name.
-        places: of its directions among all.
+        effect: name of the effect.
+        places: indices of its directions among all directions.
     """
 
     effect: str
@@ -61,14 +61,14 @@ class Column:
 
 @dataclass(frozen=True)
 class Rows:
-    """(1) as a linear regression, each row in units of its noise.
+    """Equation (1) as a linear regression, with each row in units of its noise.
 
     Attributes:
-        left: (N,) of the residual.
-        base: (N, B) of parameters and initial states.
-        effects: (N, K) of all directions.
-        run: (N,) of which run each row is.
-        state: (N, F) time, channels of the base model and inputs there.
+        left: residual, (N,).
+        base: columns of parameters and initial states, (N, B).
+        effects: columns of all directions, (N, K).
+        run: index of the run of each row, (N,).
+        state: time, channels of the base model and inputs, (N, F).
     """
 
     left: Array
@@ -78,16 +78,21 @@ class Rows:
     state: Array
 
     def of(self, runs: Sequence[int]) -> Rows:
-        """The rows of some runs."""
+        """Select the rows of some runs."""
         chosen = np.isin(self.run, list(runs))
         return Rows(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
     def projected(self) -> tuple[Array, Array]:
-        """(N,) and (N, K): what parameters and initial states cannot take up of them."""
+        """Project out parameters and initial states.
+
+        Returns:
+            The residual (N,) and the effect columns (N, K), without the part that parameters and
+            initial states can explain.
+        """
         scale = np.sqrt(np.square(self.base).sum(axis=0))
         basis = self.base[:, scale > 0] / scale[scale > 0]
         orthonormal, triangle = np.linalg.qr(basis)
-        # A parameter that others stand for already has no direction of its own.
+        # Parameters that depend linearly on others have no direction of their own.
         kept = orthonormal[:, np.abs(np.diag(triangle)) > 1e-10]
         left: Array = self.left - kept @ (kept.T @ self.left)
         effects: Array = self.effects - kept @ (kept.T @ self.effects)
@@ -95,24 +100,25 @@ class Rows:
 
 
 class Evidence:
-    """The base model of a case, and what would change it.
+    """Base model fitted to the recording of a case, and the directions of the effects.
 
     Args:
-        case: its recording is fitted, with the runs for fitting or with all.
-        every: whether runs that are held out are fitted too.
+        case: the case.
+        every: whether held-out runs are fitted too.
 
     Attributes:
         world: the runs and the simulator.
-        noise: of each channel, stated or estimated.
-        base: the fitted base model.
-        fitted: numbers of the runs that are for fitting.
-        held_out: numbers of the others.
+        noise: noise of each channel, stated or estimated.
+        stated: whether the noise of each channel is stated.
+        base: fitted base model.
+        fitted: indices of the runs for fitting.
+        held_out: indices of the held-out runs.
     """
 
     def __init__(self, case: Case, every: bool = True) -> None:
         recording = case.recording
         runs = [*recording.training(), *(recording.held_out() if every else ())]
-        # A robot steps as its file says.
+        # The simulator of a robot uses the step that its model file states.
         engine = None if case.kind.own_engine else "batch"
         self.world = World(case.kind, recording, runs, engine, candidates=list(case.library))
         floor = noise_floor(self.world, recording)
@@ -124,38 +130,39 @@ class Evidence:
         self.held_out = range(count, len(runs))
 
     def close(self) -> None:
-        """Give back what the engine holds."""
+        """Release the resources of the engine."""
         self.world.close()
 
     @cached_property
     def seen(self) -> Mask:
-        """(R, T, C) samples that there are."""
+        """Mask of the samples that are not missing, (R, T, C)."""
         return np.isfinite(self.world.observed)
 
     @cached_property
     def residual(self) -> Array:
-        """(R, T, C) observed less the base model, zero where nothing was seen."""
+        """Observed minus simulated, (R, T, C); zero where a sample is missing."""
         left = self.world.observed - self.base.fit.simulated
         residual: Array = np.where(self.seen, left, 0.0)
         return residual
 
     @cached_property
     def directions(self) -> Directions:
-        """What each effect would change."""
+        """Directions of all effects."""
         return directions(self.world, self.base.fit, self.world.library)
 
     @cached_property
     def columns(self) -> list[Column]:
-        """Of each effect every grid point."""
+        """Columns of all effects, one for each point of their parameter grids."""
         places: dict[tuple[str, int, int], list[int]] = {}
         for i, probe in enumerate(self.directions.probes):
-            # Directions that are whole changes stand for one size each, and do not add up.
+            # Each direction of a fixed size is a column of its own, because such directions do not
+            # add up.
             alone = i if probe.fixed else -1
             places.setdefault((probe.effect, probe.group, alone), []).append(i)
         return [Column(effect, tuple(members)) for (effect, *_), members in places.items()]
 
     def trajectories(self) -> Rows:
-        """(1) along the trajectories, every sample a row."""
+        """Build the regression (1) with one row per sample."""
         fit = self.base.fit
         runs, length, channels, _ = fit.jacobian.shape
         return self._rows(
@@ -167,8 +174,10 @@ class Evidence:
         )
 
     def accelerations(self, seconds: float = WINDOW) -> Rows:
-        """(2) of it: accelerations in units of what noise makes of them, by polynomials of this
-        length.
+        """Build the regression (2) of accelerations, in units of their noise.
+
+        Args:
+            seconds: window of the local polynomials.
         """
         left, sigma, seen = self._filtered(self.residual[..., None], seconds)
         base, _, _ = self._filtered(self._base_columns(), seconds)
@@ -180,7 +189,8 @@ class Evidence:
 
     def _rows(self, left: Array, base: Array, effects: Array, sigma: Array, seen: Mask) -> Rows:
         runs = np.broadcast_to(np.arange(len(left))[:, None, None], seen.shape)
-        # An impact makes some numbers very large; nothing can be learned where one is none.
+        # An impact makes some entries very large or not finite; rows that are not finite are
+        # excluded.
         whole = seen & np.isfinite(base).all(axis=3) & np.isfinite(effects).all(axis=3)
         scale = 1.0 / sigma[whole]
         states = self._states()
@@ -194,7 +204,7 @@ class Evidence:
         )
 
     def _states(self) -> Array:
-        """(R, T, F) time, channels of the base model and inputs."""
+        """Return time, channels of the base model and inputs, (R, T, F)."""
         world = self.world
         runs, length, channels = world.observed.shape
         names = [channel.name for channel in world.simulator.inputs]
@@ -209,8 +219,15 @@ class Evidence:
         return states
 
     def _filtered(self, values: Array, seconds: float) -> tuple[Array, Array, Mask]:
-        """(2) of trajectories (R, T, C, K), what noise makes of it (R, T, C), and where it is
-        to be used.
+        """Apply the operator (2) to trajectories.
+
+        Args:
+            values: trajectories, (R, T, C, K).
+            seconds: window of the local polynomials.
+
+        Returns:
+            The filtered trajectories, the standard deviation of their noise (R, T, C), and the mask
+            of the samples to use (R, T, C).
         """
         from scipy.signal import savgol_coeffs, savgol_filter
 
@@ -254,7 +271,7 @@ class Evidence:
         return result, sigma, used & self.seen
 
     def _smooth_at(self, run: int, size: int, window: int) -> Mask:
-        """(T,) where the window meets neither an end of the run nor an impact."""
+        """Return a mask (T,) of the samples whose window has no impact and no end of the run."""
         good = np.ones(size, dtype=bool)
         half = window // 2
         good[:half] = good[size - half :] = False
@@ -270,8 +287,10 @@ class Evidence:
         return good
 
     def _linear(self, run: int) -> tuple[Array, Array]:
-        """A and B of (2), (T, D) each: only a coordinate's own, which is all that there is in
-        systems of one joint, and none in flight.
+        """Compute A and B of (2), each (T, D), by finite differences of the acceleration.
+
+        They are computed for systems of one coordinate. They are zero if the system's own force is
+        uniform, and for systems of several coordinates.
         """
         world, system = self.world, self.world.simulator.system
         track = world.tracks[run]
@@ -309,7 +328,7 @@ class Evidence:
 
 
 _NEAR_GROUND = 1.0
-"""Metres of the last coordinate below which a lowest point is taken for an impact."""
+"""Height in metres below which a minimum of the last coordinate counts as an impact."""
 
 
 def _odd(samples: int) -> int:
@@ -317,7 +336,15 @@ def _odd(samples: int) -> int:
 
 
 def columns_of(world: World, fit: Fit) -> Array:
-    """(R, T, C, q + n) what a fit's parameters and each run's own initial state change."""
+    """Compute the columns of a fit's parameters and of each run's own initial states.
+
+    Args:
+        world: the runs and the simulator.
+        fit: a fitted model with its Jacobian.
+
+    Returns:
+        Columns, (R, T, C, q + n).
+    """
     shared = fit.free.size
     runs, length, channels, _ = fit.jacobian.shape
     unknown = [np.flatnonzero(~world.known[r]) for r in range(runs)]
@@ -334,15 +361,15 @@ def columns_of(world: World, fit: Fit) -> Array:
 def strongest(
     left: Array, effects: Array, columns: Sequence[Column]
 ) -> dict[str, tuple[float, Column]]:
-    """Of each effect the grid point that explains most of what is left, and how much.
+    """Find for each effect the column that explains most of the residual.
 
     Args:
-        left: (N,) projected.
-        effects: (N, K) projected.
-        columns: grid points.
+        left: residual after projection, (N,).
+        effects: effect columns after projection, (N, K).
+        columns: columns of the effects.
 
     Returns:
-        By effect the drop of the sum of squares, and the column.
+        By effect, the decrease of the sum of squares and the column.
     """
     best: dict[str, tuple[float, Column]] = {}
     for column in columns:

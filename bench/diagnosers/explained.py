@@ -1,4 +1,4 @@
-"""simgap's own: `simgap explain`, with all that it does (docs/explain.md)."""
+"""`simgap explain` as a diagnoser (docs/explain.md)."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from sims.extended import Number
 
 
 class Explained(Diagnoser):
-    """simgap explain: scores every effect in trajectory space, refits the best, holds runs out."""
+    """simgap explain: scores effects in trajectory space, refits the best, validates the result."""
 
     name = "simgap"
 
     def diagnose(self, case: Case) -> Answer:
-        """The verdict of `simgap explain` on the recording as it lies."""
+        """Return the verdict of `simgap explain` on the recording."""
         from bench.gap.explain import explain
 
         verdict = explain(case.path, seed=int(case.rng.integers(1 << 31))).answer
-        # Of the best score of the whole library, by surrogates.
+        # p-value of the best score of the whole library, from surrogate data.
         chance = min((candidate.p_value for candidate in verdict.candidates), default=None)
         causes = tuple(
             Named(

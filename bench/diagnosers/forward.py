@@ -1,14 +1,14 @@
-"""Forward selection: effects are added one at a time, each refitted by simulation with the
-parameters and initial states, as long as a criterion says so.
+"""Forward selection: add one effect at a time, refitted with parameters and initial states.
 
-BIC (G. Schwarz, Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136), of n samples and k numbers
+A criterion decides when to stop. BIC (G. Schwarz, Ann. Stat. 6(2), 461, 1978,
+doi:10.1214/aos/1176344136), with n samples and k numbers,
 
     BIC = n log(S / n) + k log n,    S the sum of squares in units of the noise               (1)
 
-needs no level of noise; effects within 2 of the best are not told apart (R. E. Kass, A. E. Raftery,
-JASA 90, 773, 1995). Chi squared takes the noise as it is stated or estimated: a model is good
-enough whose S is no larger than noise makes it in one of a hundred recordings (P. R. Bevington,
-D. K. Robinson, Data Reduction and Error Analysis, chapter 11). Both take the noise to be white.
+does not need the noise level; effects within 2 of the best are indistinguishable (R. E. Kass, A. E.
+Raftery, JASA 90, 773, 1995). Chi squared uses the stated or estimated noise: a model is sufficient
+if noise alone makes S as large in more than one of a hundred recordings (P. R. Bevington, D. K.
+Robinson, Data Reduction and Error Analysis, chapter 11). Both assume white noise.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from bench.gap.model.problem import Fit, Start
 from sims.base import Array
 
 MOST = 3
-"""Effects at most."""
+"""Maximum number of effects."""
 REFITTED = 8
-"""Effects that are refitted in each round: those that explain most to first order."""
+"""Number of effects refitted per round: those with the best first-order prediction."""
 STEPS = 15
-"""Of a fit, at most."""
+"""Maximum number of iterations of a fit."""
 CLOSED = 0.7
-"""Share of the gap that must be closed to name what closes it."""
+"""Minimum fraction of the gap that must be closed before its causes are named."""
 LEVEL = 0.01
-"""Chance of a false alarm that is wanted."""
+"""False-alarm probability."""
 WITHIN = 6.63
-"""Of chi squared, within which two models are not told apart: one degree of freedom, 1 %."""
+"""Chi-squared difference up to which two models are indistinguishable: 1 %, one free parameter."""
 BARELY = 2.0
-"""The same of BIC."""
+"""BIC difference up to which two models are indistinguishable."""
 SIGMAS = 1.96
-"""Half width of a 95 % interval."""
+"""Half width of a 95 % interval in standard errors."""
 
 
 class Refit(NamedTuple):
-    """A model that was fitted.
+    """Fitted model.
 
     Attributes:
-        fit: of it.
-        squares: its sum of squares, in units of the noise.
-        numbers: that were fitted, initial states among them.
+        fit: the fit.
+        squares: sum of squares of the residual, in units of the noise.
+        numbers: number of fitted parameters, including initial states.
     """
 
     fit: Fit
@@ -60,10 +60,10 @@ class Refit(NamedTuple):
 
 
 class _Forward(Diagnoser):
-    """Shared by both."""
+    """Base class of the forward selections."""
 
     def diagnose(self, case: Case) -> Answer:
-        """Effects that were added, and what does as well as the last of them."""
+        """Name the selected effects, with alternatives of equal quality."""
         evidence = Evidence(case)
         try:
             return self._selected(evidence)
@@ -117,15 +117,33 @@ class _Forward(Diagnoser):
 
     @abstractmethod
     def value(self, one: Refit, samples: int) -> float:
-        """What is minimised."""
+        """Compute the criterion, which is minimised.
+
+        Args:
+            one: a fitted model.
+            samples: number of samples.
+        """
 
     @abstractmethod
     def enough(self, one: Refit, samples: int) -> bool:
-        """Whether nothing more is to be looked for."""
+        """Return whether a model is sufficient, so that the search can stop.
+
+        Args:
+            one: a fitted model.
+            samples: number of samples.
+        """
 
     @abstractmethod
     def chance(self, first: Refit, samples: int) -> float | None:
-        """Of the base model's evidence if nothing were missing."""
+        """Compute the p-value of the base model under the hypothesis that nothing is missing.
+
+        Args:
+            first: the fitted base model.
+            samples: number of samples.
+
+        Returns:
+            The p-value, or None if the criterion gives none.
+        """
 
 
 class ForwardBIC(_Forward):
@@ -135,15 +153,20 @@ class ForwardBIC(_Forward):
     near = BARELY
 
     def value(self, one: Refit, samples: int) -> float:
-        """(1)."""
+        """Compute BIC, equation (1).
+
+        Args:
+            one: a fitted model.
+            samples: number of samples.
+        """
         return float(samples * np.log(one.squares / samples) + one.numbers * np.log(samples))
 
     def enough(self, one: Refit, samples: int) -> bool:
-        """It knows no absolute measure: it goes on while a model is better."""
+        """Return False: BIC only compares models; the search continues while a model is better."""
         return False
 
     def chance(self, first: Refit, samples: int) -> float | None:
-        """It gives none."""
+        """Return None: BIC gives no p-value."""
         return None
 
     def _answer(
@@ -163,21 +186,21 @@ class ForwardBIC(_Forward):
 
 
 class ForwardChi2(_Forward):
-    """Forward selection of refitted effects by chi squared, against the noise."""
+    """Forward selection of refitted effects by chi squared, with stated or estimated noise."""
 
     name = "forward-chi2"
     near = WITHIN
 
     def value(self, one: Refit, samples: int) -> float:
-        """The sum of squares."""
+        """Return the sum of squares."""
         return one.squares
 
     def enough(self, one: Refit, samples: int) -> bool:
-        """Whether noise alone leaves as much in more than one of a hundred recordings."""
+        """Return whether the chi-squared p-value of the model is above `LEVEL`."""
         return self._chance(one, samples) > LEVEL
 
     def chance(self, first: Refit, samples: int) -> float | None:
-        """By chi squared of the base model."""
+        """Compute the chi-squared p-value of the base model."""
         return self._chance(first, samples)
 
     @staticmethod
@@ -195,7 +218,11 @@ def _entered(evidence: Evidence, fit: Fit) -> Refit:
 
 
 def _extended(evidence: Evidence, at: Fit) -> list[Fit]:
-    """The model with one more effect, for each of the most promising ones, refitted."""
+    """Add each of the most promising effects to a model, and refit.
+
+    Returns:
+        The best fit for each effect.
+    """
     world = evidence.world
     names = [name for name in world.library if name not in at.effects]
     evidence = _about(evidence, at)
@@ -221,7 +248,7 @@ def _extended(evidence: Evidence, at: Fit) -> list[Fit]:
 
 
 def _about(evidence: Evidence, at: Fit) -> Evidence:
-    """The same evidence about another model."""
+    """Copy the evidence, with another fitted model as the base model."""
     other = object.__new__(Evidence)
     kept = ("world", "noise", "stated", "base", "fitted", "held_out")
     other.__dict__.update({name: evidence.__dict__[name] for name in kept})
@@ -232,8 +259,10 @@ def _about(evidence: Evidence, at: Fit) -> Evidence:
 def _starts(
     evidence: Evidence, at: Fit, name: str, column: Column, left: Array, effects: Array
 ) -> list[Start]:
-    """Where a fit with one more effect begins: at the size that the direction says, and at a part
-    of it, since a direction holds for small ones.
+    """Choose starting values for a fit with one more effect.
+
+    They are the size predicted by the linear model, and 0.3 of it because the linear model holds
+    for small sizes only.
     """
     world = evidence.world
     probes = [evidence.directions.probes[place] for place in column.places]
@@ -252,7 +281,7 @@ def _starts(
 
 
 def _intervals(evidence: Evidence, one: Refit) -> dict[str, tuple[float | None, float | None]]:
-    """95 % intervals of what was fitted, by name, from the curvature at the fit."""
+    """Compute 95 % intervals of the fitted parameters, by name, from the curvature at the fit."""
     world, fit = evidence.world, one.fit
     columns = columns_of(world, fit) / evidence.noise.sigma[:, None]
     rows = columns[evidence.seen]
@@ -273,6 +302,6 @@ def _intervals(evidence: Evidence, one: Refit) -> dict[str, tuple[float | None, 
 def _of(
     ends: dict[str, tuple[float | None, float | None]], effect: str
 ) -> dict[str, tuple[float | None, float | None]]:
-    """The intervals of one effect's coefficients, by their own names."""
+    """Select the intervals of one effect's coefficients, by the name of the coefficient."""
     begin = f"{effect}."
     return {name.removeprefix(begin): e for name, e in ends.items() if name.startswith(begin)}

@@ -1,10 +1,10 @@
 """Sparse regression of acceleration residuals on the library of effects.
 
-Two ways to choose a few of many terms, both by PySINDy: sequentially thresholded least squares
-(S. L. Brunton, J. L. Proctor, J. N. Kutz, PNAS 113(15), 3932, 2016, doi:10.1073/pnas.1517384113)
-and forward regression with orthogonal least squares (S. Chen, S. A. Billings, W. Luo, Int. J.
-Control 50(5), 1873, 1989, doi:10.1080/00207178908953472). How many terms is decided by the runs
-that are held out: the fewest that predict their accelerations about as well as the best.
+Two methods of PySINDy select few of many terms: sequentially thresholded least squares (S. L.
+Brunton, J. L. Proctor, J. N. Kutz, PNAS 113(15), 3932, 2016, doi:10.1073/pnas.1517384113) and
+forward regression with orthogonal least squares (S. Chen, S. A. Billings, W. Luo, Int. J. Control
+50(5), 1873, 1989, doi:10.1080/00207178908953472). The held-out runs decide the number of terms: the
+smallest that predicts their accelerations about as well as the best.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ from bench.diagnosers.evidence import Column, Evidence, strongest
 from sims.base import Array
 
 WINDOWS = (0.15, 0.4, 1.0)
-"""Seconds of the polynomials: long ones see slow effects, short ones quick ones."""
+"""Windows of the local polynomials, seconds: long for slow effects, short for fast ones."""
 EVIDENCE = 2.5
-"""Standard errors by which held-out errors must fall."""
+"""Minimum decrease of the held-out error, in standard errors."""
 ALIKE = 0.95
-"""Correlation from which two columns are taken for one cause."""
+"""Correlation above which two columns count as the same cause."""
 SAME = 0.999
-"""Correlation from which one of two columns is left out of the regression."""
+"""Correlation above which one of two columns is excluded from the regression."""
 RIDGE = 1e-6
-"""Of the least squares, whose columns have unit variance."""
+"""Ridge penalty of the least squares, for columns with unit variance."""
 BLOCKS = 10
-"""Parts of the held-out runs, whose errors tell how well an error is known."""
+"""Number of blocks of the held-out runs, from which the standard error is estimated."""
 MOST = 3
-"""Terms at most."""
+"""Maximum number of terms."""
 
 
 class _Found(NamedTuple):
-    """What one regression gives: how well it is known that it predicts, and what it names."""
+    """Significance of the prediction of one regression in standard errors, and its named causes."""
 
     sigmas: float
     causes: tuple[Named, ...]
 
 
 class _Regression(Diagnoser):
-    """Shared by both."""
+    """Base class of the sparse regressions."""
 
     requires: ClassVar[tuple[str, ...]] = ("pysindy",)
 
     def diagnose(self, case: Case) -> Answer:
-        """Terms that predict the accelerations of runs that are held out."""
+        """Name the terms that predict the accelerations of the held-out runs."""
         evidence = Evidence(case)
         try:
             found = [self._found(evidence, window) for window in WINDOWS]
@@ -69,7 +69,7 @@ class _Regression(Diagnoser):
         return Answer("ambiguous" if sets else "named", best.causes)
 
     def _found(self, evidence: Evidence, window: float) -> _Found | None:
-        """What a regression with this window gives; None where there are too few samples."""
+        """Run the regression with one window; return None if there are too few samples."""
         rows = evidence.accelerations(window)
         fitted, held_out = rows.of(evidence.fitted), rows.of(evidence.held_out)
         if min(len(fitted.left), len(held_out.left)) <= fitted.base.shape[1] + 2 * BLOCKS:
@@ -95,7 +95,7 @@ class _Regression(Diagnoser):
 
     @abstractmethod
     def _models(self, library: Array, left: Array) -> Iterator[Array]:
-        """Coefficients (K,) of models with more and more terms."""
+        """Yield the coefficients (K,) of models with different numbers of terms."""
 
 
 class STLSQ(_Regression):
@@ -122,7 +122,8 @@ class FROLS(_Regression):
 
         for most in range(min(2 * MOST, library.shape[1]), 0, -1):
             model = optimizers.FROLS(max_iter=most, alpha=RIDGE * len(left))
-            # It stops in an error where what is left of all others depends on what it has chosen.
+            # FROLS raises an error if the rest of all other terms depends linearly on the selected
+            # ones.
             with suppress(ValueError):
                 model.fit(library, left[:, None])
                 yield from (coefficients[0] for coefficients in model.history_)
@@ -132,7 +133,11 @@ class FROLS(_Regression):
 def _independent(
     terms: Sequence[tuple[str, int]], effects: Array
 ) -> tuple[list[tuple[str, int]], Array]:
-    """Terms without those whose column is that of an earlier one, and their columns."""
+    """Select the terms whose column differs from those of earlier terms.
+
+    Returns:
+        The terms, and their columns.
+    """
     kept: list[tuple[str, int]] = []
     columns: list[Array] = []
     for effect, place in terms:
@@ -149,8 +154,11 @@ def _independent(
 
 
 def _simplest(models: Sequence[Array], left: Array, library: Array) -> tuple[Array, float]:
-    """The model of fewest terms whose held-out error is within one standard error of the best, and
-    by how many standard errors that is better than nothing; nothing where it is too few.
+    """Select the simplest model whose held-out error is within one standard error of the best.
+
+    Returns:
+        Its coefficients (zero if no model is significantly better than none), and the improvement
+        of the best model over no terms in standard errors.
     """
     nothing = np.zeros(library.shape[1])
     every = [nothing, *models]
@@ -169,20 +177,23 @@ def _simplest(models: Sequence[Array], left: Array, library: Array) -> tuple[Arr
 
 
 def _blocks(error: Array) -> Array:
-    """(BLOCKS,) mean squares of parts that follow each other: errors of neighbours are alike."""
+    """Compute the mean squared errors of consecutive blocks, (BLOCKS,).
+
+    Blocks are used because the errors of neighbouring samples are correlated.
+    """
     ends = np.linspace(0, len(error), BLOCKS + 1).astype(int)
     return np.array([np.square(error[a:b]).mean() for a, b in pairwise(ends.tolist())])
 
 
 def _doubt(differences: Array) -> float:
-    """Standard error of their mean."""
+    """Compute the standard error of the mean of differences."""
     return float(differences.std(ddof=1) / np.sqrt(len(differences)))
 
 
 def _alike(
     name: str, picked: Sequence[str], columns: Sequence[Column], effects: Array
 ) -> tuple[str, ...]:
-    """Effects that were not picked, and one of whose columns is nearly that of one that was."""
+    """List effects that were not selected but are nearly collinear with a selected effect."""
 
     def units(column: Column) -> Array:
         part = effects[:, list(column.places)]

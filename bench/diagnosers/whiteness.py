@@ -1,10 +1,11 @@
-"""Whiteness of residuals, and correlations above a threshold.
+"""Whiteness test of the residual, and correlation with the directions of the effects.
 
-The base model is fitted, its residual is tested for whiteness (G. M. Ljung, G. E. P. Box,
-Biometrika 65(2), 297, 1978, doi:10.1093/biomet/65.2.297), and what correlates with it is named: the
-residual analysis of the textbooks (L. Ljung, System Identification, 2nd ed., section 16.6), and
-what released agents for system identification do with thresholds of 0.3 to 0.5. What correlates is
-each effect's own direction, after parameters and initial states have taken up what they can.
+The base model is fitted and its residual is tested for whiteness (G. M. Ljung, G. E. P. Box,
+Biometrika 65(2), 297, 1978, doi:10.1093/biomet/65.2.297). The effects that correlate with it are
+named. This is the residual analysis of textbooks (L. Ljung, System Identification, 2nd ed., section
+16.6), and of published agents for system identification, with thresholds of 0.3 to 0.5. The
+correlation is computed with the direction of each effect, after parameters and initial states are
+projected out.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from bench.diagnoser import Answer, Case, Diagnoser, Named
 from bench.diagnosers.evidence import Evidence, strongest
 
 LEVEL = 0.01
-"""Chance of a false alarm that is wanted, over all runs and channels."""
+"""False-alarm probability over all runs and channels."""
 LAGS = 20
-"""Autocorrelations that are added up."""
+"""Number of autocorrelations in the Ljung-Box statistic."""
 CORRELATION = 0.5
-"""With an effect's direction, from which it is named."""
+"""Minimum correlation with an effect's direction for which the effect is named."""
 CLOSE = 0.02
-"""Correlations that are no farther from the highest are not told apart."""
+"""Difference from the highest correlation up to which effects are indistinguishable."""
 
 
 class Whiteness(Diagnoser):
@@ -30,7 +31,7 @@ class Whiteness(Diagnoser):
     name = "ljung-box"
 
     def diagnose(self, case: Case) -> Answer:
-        """Named is what correlates best, where the residual is not white."""
+        """Name the effects with the highest correlation if the residual is not white."""
         evidence = Evidence(case)
         try:
             chance = _whiteness(evidence)
@@ -53,7 +54,7 @@ class Whiteness(Diagnoser):
 
 
 def _whiteness(evidence: Evidence) -> float:
-    """Probability of the least white residual of all runs and channels, times their number."""
+    """Compute the smallest Ljung-Box p-value of all runs and channels, Bonferroni-corrected."""
     from statsmodels.stats.diagnostic import acorr_ljungbox
 
     chances = []

@@ -1,7 +1,7 @@
-"""What the process that starts diagnosers loads ahead, so that no answer need do it: numerical
-packages, the search for causes, the effects, the compiled steps and what they are compiled from.
+"""Modules that the fork server preloads, so that no diagnosis has to import or compile them.
 
-Nobody's recording is in it: each system is simulated and searched once, in a world of its own.
+They are numerical packages, the search for causes, the effects and the compiled integration steps.
+No recording of a case is loaded: each system is simulated and searched once with made-up data.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from sims.engines.compiled import machine
 from sims.simulated import Simulated
 
 _SIGMA = 1e-3
-"""Noise of the recordings that are searched."""
+"""Noise standard deviation of the recordings used for the warm-up."""
 
 
 def _searched(system: str) -> None:
-    """Fit a recording of a system, and look what each effect would change."""
+    """Fit a simulated recording of a system and compute the direction of each effect."""
     wish = Wish(system=system, noise={"*": _SIGMA}, runs=2, seconds=0.5, rate=50.0, engine="batch")
     made = make(wish)
     kind = type(made.simulator)

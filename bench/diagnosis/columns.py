@@ -1,4 +1,4 @@
-"""What stands in the tables of a comparison of diagnosers: every column, declared once."""
+"""Columns of all tables of a comparison of diagnosers."""
 
 from __future__ import annotations
 
@@ -89,20 +89,20 @@ TABLES: Mapping[str, Columns] = {
     ),
     "items": _ITEM,
 }
-"""Tables by the name of their file."""
+"""Columns of each table, by the name of its file."""
 STATUS = ("question", "diagnoser", "status", "reason", "simulations", "seconds")
-"""Columns of items.csv that say how an answer came about."""
+"""Columns of items.csv that describe how an answer was produced."""
 
 
 def read_table(folder: Path, name: str) -> pd.DataFrame:
-    """A table of a comparison of diagnosers, as it was written.
+    """Read a table of a comparison of diagnosers.
 
     Args:
-        folder: of the comparison.
+        folder: result folder of the comparison.
         name: one of `TABLES`.
 
     Raises:
-        InputError: it is not there, or damaged.
+        InputError: the file does not exist or is damaged.
     """
     path = folder / f"{name}.csv"
     remedy = f"simgap plot {folder} writes it again"
@@ -111,7 +111,14 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
 
 
 def board(table: pd.DataFrame) -> pd.DataFrame:
-    """A row a diagnoser and a column a metric of `table`, shares; who names most comes first."""
+    """Build the leaderboard: one row per diagnoser and one column per metric.
+
+    Args:
+        table: the table of all metrics, see `bench.diagnosis.tables.table`.
+
+    Returns:
+        Fractions; the diagnoser with the highest primary metric comes first.
+    """
     wide = table.pivot(index="diagnoser", columns="metric", values="share")
     wide = wide[list(dict.fromkeys(table["metric"]))]
     named: pd.DataFrame = wide.sort_values(NAMED, ascending=False, kind="stable")

@@ -1,4 +1,4 @@
-"""The figure of what families of causes are taken for."""
+"""Confusion matrices of cause families."""
 
 from __future__ import annotations
 
@@ -16,15 +16,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SAID = ("several", "unknown", "nothing", "no answer")
-"""What is said beside a family's name; `nothing` is that the simulation is adequate."""
+"""Answers that are not the name of a family; `nothing` means that the simulation is adequate."""
 _ACROSS = 4
-"""Panels in a row."""
+"""Maximum number of panels in a row."""
 _WRITTEN = 10.0
-"""Per cent of a row from which a cell has its number."""
+"""Minimum percentage of its row for which a cell shows its number."""
 
 
 def families(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
-    """What is said of each family of hidden causes, a panel a diagnoser."""
+    """Draw one confusion matrix of cause families for each diagnoser.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+        title: title of the figure.
+    """
     asked = counted(rows[rows["kind"] != "double"])
     asked = asked.assign(family=_hidden(asked), answer=_answers(asked))
     hidden = sorted(set(asked["family"]), key=lambda name: (name in _LAST, name))
@@ -58,9 +64,9 @@ def families(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
 
 
 _LAST = ("(foreign)", "(clean)")
-"""Rows below those of effects."""
+"""Row labels that follow below those of the effect families."""
 _RIGHT = {"(clean)": ("nothing",), "(foreign)": ("unknown",)}
-"""What is right there."""
+"""Correct answers for the rows of clean recordings and unmodelled causes."""
 
 
 def _hidden(rows: pd.DataFrame) -> pd.Series[str]:
@@ -76,7 +82,7 @@ def _answers(rows: pd.DataFrame) -> list[str]:
 
 
 def _answer(row: dict[Any, Any], is_right: bool) -> str:
-    """The family that an answer names, or what it says instead."""
+    """Return the family that an answer names, or the label of an answer without a family."""
     if row["status"] != "done":
         return "no answer"
     if row["verdict"] == "adequate":
@@ -92,7 +98,7 @@ def _answer(row: dict[Any, Any], is_right: bool) -> str:
 
 
 def _panel(axis: Axes, counts: pd.DataFrame, name: str) -> None:
-    """One diagnoser's matrix."""
+    """Draw the confusion matrix of one diagnoser."""
     from matplotlib.patches import Rectangle
 
     totals = counts.sum(axis=1).to_numpy()

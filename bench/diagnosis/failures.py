@@ -1,4 +1,4 @@
-"""What a diagnoser got wrong, answer by answer, and who got it right."""
+"""Incorrect answers of each diagnoser, and the diagnosers that answered the same case correctly."""
 
 from __future__ import annotations
 
@@ -25,12 +25,15 @@ COLUMNS = (
     "largest_set",
     "right_by",
 )
-"""Of the table: those of items.csv, and who answered rightly."""
+"""Columns of the table of failures: a selection of items.csv, and who answered correctly."""
 
 
 def right(rows: pd.DataFrame) -> pd.Series[bool]:
-    """Whether each answer is what it should be: of a clean recording no alarm, of causes all named
-    alone or in sets of at most two, of a foreign cause that none of the library's explains it.
+    """Return whether each answer is correct.
+
+    Correct is: no alarm for a clean recording; for hidden effects, all named alone or in sets of at
+    most two, equivalent effects counted once; for an unmodelled cause, the statement that no effect
+    of the library explains it.
     """
     by_kind = {
         "clean": ~rows["alarm"].astype(bool),
@@ -43,12 +46,17 @@ def right(rows: pd.DataFrame) -> pd.Series[bool]:
 
 
 def counted(rows: pd.DataFrame) -> pd.DataFrame:
-    """The answers that a board counts: all but those about effects smaller than one noise."""
+    """Select the graded answers: all except those on single effects smaller than one noise."""
     return rows[(rows["kind"] != "single") | (rows["size"] >= AT_LEAST)]
 
 
 def failures(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """A row for each answer that is counted and not right, by diagnoser and question."""
+    """Build the table of incorrect graded answers, ordered by diagnoser, kind and case.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+    """
     asked = counted(rows)
     asked = asked.assign(right=right(asked))
     good = asked[asked["right"]].groupby("question")["diagnoser"].agg(list).to_dict()

@@ -1,4 +1,4 @@
-"""Figures of a comparison of diagnosers, from its tables; readable in print and in grey."""
+"""Figures of a comparison of diagnosers, readable in print and in greyscale."""
 
 from __future__ import annotations
 
@@ -26,13 +26,18 @@ OUTCOMES = (
     ("undecided", style.SHADE, "unidentifiable"),
     ("failed", style.PURPLE, "no answer"),
 )
-"""Of single effects, the best first: its colour and what a legend calls it."""
+"""Outcomes of single effects, the best first, with colour and legend text."""
 WANTED_ALARMS = 0.01
-"""Share of false alarms that a user may expect at most."""
+"""Maximum acceptable fraction of false alarms, drawn as a reference line."""
 
 
 def look(name: str, order: Sequence[str]) -> dict[str, Any]:
-    """Colour, marker and line of a diagnoser, by its place."""
+    """Return colour, marker and line style of a diagnoser, by its position in the order.
+
+    Args:
+        name: name of the diagnoser.
+        order: names of all diagnosers.
+    """
     place = list(order).index(name)
     return {
         "color": style.colour(place),
@@ -43,7 +48,13 @@ def look(name: str, order: Sequence[str]) -> dict[str, Any]:
 
 
 def board(table: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
-    """False alarms against what is named: the best stand left and high."""
+    """Draw diagnosed single causes against false alarms; the best position is top left.
+
+    Args:
+        table: table of all metrics.
+        order: names of the diagnosers.
+        title: title of the figure.
+    """
     figure, axes = style.blank(1, 1, (7.6, 4.8))
     axis: Axes = axes[0][0]
     alarms = by_diagnoser(table, "false alarms")
@@ -85,7 +96,13 @@ def board(table: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
 
 
 def power(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
-    """What is named, and what is seen at all, against the size of the effect."""
+    """Draw the fractions of causes diagnosed and detected, against the size of the effect.
+
+    Args:
+        frame: table of the power.
+        order: names of the diagnosers.
+        title: title of the figure.
+    """
     figure, axes = style.blank(1, 2, (9.6, 4.4), sharey=True)
     for axis, metric, says in zip(
         axes[0],
@@ -135,7 +152,13 @@ def power(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
 
 
 def outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
-    """What became of each recording with one hidden effect."""
+    """Draw the outcomes of all recordings with one hidden effect, as stacked bars.
+
+    Args:
+        rows: one row per answer on a single effect.
+        order: names of the diagnosers.
+        title: title of the figure.
+    """
     figure, axes = style.blank(1, 1, (8.6, 0.5 * len(order) + 2.2))
     axis: Axes = axes[0][0]
     places = np.arange(len(order))[::-1]
@@ -177,7 +200,15 @@ def outcomes(rows: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
 
 
 def calibration(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
-    """How often p is at most a level where nothing is hidden: the level itself, if p is one."""
+    """Draw the fraction of clean recordings with a p-value at most a level, against the level.
+
+    For a calibrated p-value, the fraction equals the level.
+
+    Args:
+        frame: calibration table.
+        order: names of the diagnosers.
+        title: title of the figure.
+    """
     figure, axes = style.blank(1, 1, (6.8, 4.4))
     axis: Axes = axes[0][0]
     levels = sorted(frame["level"].unique())
@@ -216,7 +247,14 @@ def calibration(frame: pd.DataFrame, order: Sequence[str], title: str) -> Figure
 
 
 def cost(costs: pd.DataFrame, table: pd.DataFrame, order: Sequence[str], title: str) -> Figure:
-    """What an answer costs against what is named."""
+    """Draw diagnosed single causes against the cost of an answer.
+
+    Args:
+        costs: table of the costs.
+        table: table of all metrics.
+        order: names of the diagnosers.
+        title: title of the figure.
+    """
     figure, axes = style.blank(1, 2, (9.6, 4.2), sharey=True)
     named = by_diagnoser(table, NAMED)
     held = by_diagnoser(costs)
@@ -264,6 +302,6 @@ def cost(costs: pd.DataFrame, table: pd.DataFrame, order: Sequence[str], title: 
 
 
 def _bars(line: Line) -> list[list[float]]:
-    """Both lengths of an error bar, in per cent."""
+    """Return the lower and upper length of an error bar, in per cent."""
     share, low, high = (float(line[key]) for key in ("share", "low", "high"))
     return [[100 * max(share - low, 0.0)], [100 * max(high - share, 0.0)]]

@@ -1,9 +1,8 @@
-"""The diagnoser's side of the pipe: writes the recording into its own folder, asks the diagnoser,
-and sends back what it says.
+"""Server side of an isolated diagnoser: write the recording, call the diagnoser, send its answer.
 
-Nothing here can be trusted by the harness once a plugin's code has run beside it. The number of
-simulations is counted in this process, where a plugin that wanted to could change it; what it could
-not come by is the truth, which no process of a diagnoser ever holds.
+The harness cannot trust anything from this process once the code of a plugin has run in it. The
+simulations are counted in this process, so a malicious plugin could change their number. It cannot
+obtain the truth, because no process of a diagnoser ever contains it.
 """
 
 from __future__ import annotations
@@ -31,13 +30,19 @@ from sims.simulated import Simulated
 from sims.tally import TALLY
 
 _LIMIT = 1 << 40
-"""What the harness sends is not bounded: it is trusted."""
+"""Maximum size in bytes of a message from the harness; large, because the harness is trusted."""
 _DOCUMENT = 1 << 30
-"""Bytes of a question."""
+"""Maximum size in bytes of a case document."""
 
 
 def serve(channel: Channel, reach: Reach, held: list[str]) -> None:
-    """Do what is asked until nobody asks any more."""
+    """Answer requests of the harness until the channel is closed.
+
+    Args:
+        channel: message channel to the harness.
+        reach: access policy of this process, with its own writable folder.
+        held: sent in the first message of this process.
+    """
     channel.send_document(b"R", held)
     learned: Mapping[str, Array] = {}
     with suppress(GoneError):
@@ -58,22 +63,23 @@ def serve(channel: Channel, reach: Reach, held: list[str]) -> None:
                 return
             except BaseException:
                 said = traceback.format_exc().encode("utf-8", "replace")
-                # Also what asks to exit: it is the diagnoser's doing. A long text by its end.
+                # BaseException includes SystemExit: the diagnoser caused it. Of a long text, only
+                # the end is sent.
                 channel.send(b"D", said[-TEXT_LIMIT // 2 :])
 
 
 _USED = "simulations"
-"""The array that says how many simulations a training took."""
+"""Name of the array with the number of simulations that a training used."""
 
 
 def built(wanted: Mapping[str, Any]) -> Diagnoser:
-    """The diagnoser of this name, from its module or file."""
+    """Load a diagnoser from its module or file, and create it."""
     kind: type[Diagnoser] = found(dict(wanted), Diagnoser)
     return kind()
 
 
 def simulator_of(system: str) -> type[Simulated]:
-    """The simulator of a system by its name."""
+    """Return the simulator class of a system."""
     kind = simulators.get(system)
     assert inspect.isclass(kind)
     assert issubclass(kind, Simulated)
@@ -86,14 +92,19 @@ def asked(
     learned: Mapping[str, Array],
     diagnoser: Diagnoser | None = None,
 ) -> dict[str, Any]:
-    """One answer, as JSON, or why there is to be none (``skipped``).
+    """Diagnose one case.
 
     Args:
-        question: ``wanted`` (name, module, file), ``table`` and ``description`` of the recording,
-            ``budget``, ``seconds``, ``seed``, and ``beside``, texts of files that lie beside it.
-        folder: to write the recording to.
-        learned: what the diagnoser has learned.
-        diagnoser: built already.
+        question: request with ``wanted`` (name, module, file), ``table`` and ``description`` of the
+            recording, ``budget``, ``seconds``, ``seed``, and ``beside``, texts of further files in
+            the folder of the recording.
+        folder: folder to which the recording is written.
+        learned: trained arrays of the diagnoser.
+        diagnoser: the diagnoser if it already exists.
+
+    Returns:
+        JSON document with the answer, the number of simulations and the processor time; with a
+        reason in ``skipped`` if the diagnoser does not support the simulator.
     """
     diagnoser = diagnoser or built(question["wanted"])
     path = folder / "recording.csv"
@@ -127,10 +138,13 @@ def asked(
 
 
 def taught(lesson: Mapping[str, Any]) -> tuple[Mapping[str, Array], int]:
-    """What a diagnoser learns for a system, as arrays by name, and the simulations that it took.
+    """Train a diagnoser for a system.
 
     Args:
-        lesson: ``wanted``, ``system``, ``budget``, ``seed``.
+        lesson: request with ``wanted``, ``system``, ``budget`` and ``seed``.
+
+    Returns:
+        The trained arrays by name, and the number of simulations used.
     """
     kind = simulator_of(lesson["system"])
     TALLY.begin(int(lesson["budget"]))

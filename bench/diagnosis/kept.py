@@ -1,6 +1,4 @@
-"""What a comparison of diagnosers keeps while it is made: a line of JSON for each question,
-appended when all of its answers are there.
-"""
+"""Append-only store of answers: one line of JSON per case, written when all its answers exist."""
 
 from __future__ import annotations
 
@@ -12,22 +10,20 @@ from typing import IO, Any
 from sims.base import InputError
 
 ANSWERS = "answers.jsonl"
-"""The file; the truth of every question that has been asked stands in it, out of diagnosers'
-reach.
-"""
+"""File of the answers. It also contains the truth of every case, where no diagnoser can read it."""
 
 
 class Kept:
-    """The answers in a folder, ready for more.
+    """Store of the answers in a result folder, opened for appending.
 
     Args:
-        folder: of the study.
+        folder: result folder of the study.
 
     Attributes:
-        answered: by question: its item, {} where it could not be drawn, and rows by diagnoser.
+        answered: by case name, the case ({} if it could not be drawn) and one row per diagnoser.
 
     Raises:
-        InputError: another process is at work there.
+        InputError: another process is working in the folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -44,20 +40,20 @@ class Kept:
         self.answered = read(folder)
 
     def _end_last_line(self) -> None:
-        """Put an end to a line that a kill has cut off: it is no JSON, and is read as none."""
+        """Terminate a line that was cut off when a process was killed; the reader skips it."""
         data = self._path.read_bytes()
         if data and not data.endswith(b"\n"):
             self._file.write("\n")
             self._file.flush()
 
     def add(self, one: Mapping[str, Any]) -> None:
-        """Keep the answers to a question; when this returns they survive a kill."""
+        """Append the answers to a case; they survive a kill of the process after this call."""
         self._file.write(json.dumps(one) + "\n")
         self._file.flush()
         _enter(self.answered, one)
 
     def close(self) -> None:
-        """Let others work there."""
+        """Close the file and release its lock."""
         self._file.close()
 
 
@@ -65,7 +61,11 @@ Answered = dict[str, dict[str, Any]]
 
 
 def read(folder: Path) -> Answered:
-    """All that was answered, by question: ``item``, and ``rows`` by diagnoser."""
+    """Read all answers of a result folder.
+
+    Returns:
+        By case name, ``item`` (the case) and ``rows`` by diagnoser.
+    """
     answered: Answered = {}
     path = folder / ANSWERS
     if not path.exists():
@@ -75,7 +75,7 @@ def read(folder: Path) -> Answered:
             try:
                 one = json.loads(line)
             except ValueError:
-                continue  # cut off by a kill: it was not finished
+                continue  # incomplete line of a killed process
             _enter(answered, one)
     return answered
 
@@ -88,9 +88,9 @@ def _enter(answered: Answered, one: Mapping[str, Any]) -> None:
 
 
 def _lock(file: IO[str]) -> None:
-    """Held until this process ends, however it ends."""
+    """Lock the file until it is closed or this process ends."""
     try:
         import fcntl
-    except ImportError:  # no such locks on this system
+    except ImportError:  # no file locks on this operating system
         return
     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,5 +1,6 @@
-"""What diagnosers learn before they are asked, kept in the user's cache under a key of everything
-that it depends on.
+"""Train diagnosers and cache the result in the user's cache folder.
+
+The cache key contains everything that the result depends on.
 """
 
 from __future__ import annotations
@@ -20,19 +21,19 @@ from bench.sealing.outside import Tuned
 from sims.files import replacing
 
 PLACE = "diagnosers"
-"""Below the folder of trained weights."""
+"""Subfolder of the cache of trained weights."""
 ROOMS = ("sims", "bench/sealing", "bench/gap", "bench/recordings", "bench/diagnosers")
-"""Folders whose code makes what is learned."""
+"""Source folders that determine the result of a training."""
 
 
 class Learned(NamedTuple):
-    """What a diagnoser has learned for a system.
+    """Result of training a diagnoser for a system.
 
     Attributes:
-        path: of the arrays.
-        simulations: that it took.
-        seconds: likewise, when it was done.
-        found: whether it was there already.
+        path: file with the trained arrays.
+        simulations: number of simulations that the training used.
+        seconds: time that the training took.
+        found: whether the result was already in the cache.
     """
 
     path: Path
@@ -50,19 +51,19 @@ def learn(
     hidden: tuple[str, ...],
     trusted: bool,
 ) -> Learned:
-    """Have a diagnoser learn a system, unless it has.
+    """Train a diagnoser for a system, or load the cached result.
 
     Args:
         code: where its code is.
         source: hash of its code.
-        system: which.
-        budget: simulations that it may make.
-        seconds: that it may take.
-        hidden: folders that it may not reach.
-        trusted: whether it runs in this process.
+        system: name of the system.
+        budget: maximum number of simulations.
+        seconds: maximum time.
+        hidden: folders that the diagnoser's process must not read.
+        trusted: whether the diagnoser runs in this process.
 
     Raises:
-        EndedError: it failed.
+        EndedError: the training failed.
     """
     key = digest(code.name, source, system, budget, rooms(ROOMS), versions(), length=20)
     path = folder() / PLACE / f"{code.name}-{system}-{key}.npz"

@@ -1,6 +1,4 @@
-"""What diagnosers' learning cost, in a table of the folder: it is shown apart from what answers
-cost.
-"""
+"""Training costs of diagnosers, reported in training.csv separately from the costs of answers."""
 
 from __future__ import annotations
 
@@ -17,14 +15,14 @@ COLUMNS = ("diagnoser", "system", "simulations", "seconds", "fault")
 
 
 class Taught(NamedTuple):
-    """What one diagnoser's learning of one system cost.
+    """Cost of training one diagnoser for one system.
 
     Attributes:
-        diagnoser: its label.
-        system: which.
-        simulations: that it took.
-        seconds: likewise.
-        fault: why it failed; empty where it did not.
+        diagnoser: label of the diagnoser.
+        system: name of the system.
+        simulations: number of simulations used.
+        seconds: elapsed time.
+        fault: error message if the training failed, otherwise empty.
     """
 
     diagnoser: str
@@ -35,7 +33,12 @@ class Taught(NamedTuple):
 
 
 def write_lessons(folder: Path, taught: Iterable[Taught]) -> None:
-    """Write the table; nothing where nobody learned."""
+    """Write training.csv; write no file if no diagnoser was trained.
+
+    Args:
+        folder: result folder.
+        taught: training costs, one per diagnoser and system.
+    """
     rows = [one._asdict() for one in taught]
     if not rows:
         return
@@ -47,7 +50,7 @@ def write_lessons(folder: Path, taught: Iterable[Taught]) -> None:
 
 
 def read_lessons(folder: Path) -> list[dict[str, str]]:
-    """Its rows; none where there is no table."""
+    """Read the rows of training.csv; return an empty list if the file does not exist."""
     path = folder / LESSONS
     if not path.exists():
         return []

@@ -1,19 +1,22 @@
-"""Marks an answer: what `explain` concluded (DESIGN §6, as a dictionary) against what was hidden.
+"""Grade an answer against the hidden truth of its case.
 
-| outcome | of | when |
+An answer is a dictionary as `explain` writes it (DESIGN §6).
+
+| outcome | kinds of cases | when |
 |---|---|---|
 | right | all | clean: adequate; single, double: all causes, no other; foreign: unknown or partial |
-| set | single, double | the cause stands in a set that the data are said not to tell apart |
+| set | single, double | the cause is in a set of effects that the data cannot distinguish |
 | class | single, double | an effect is named that is equivalent in any data (`items.EQUIVALENT`) |
 | one | double | one of the two is named (alone or in a set), the other is not |
-| wrong | single, double, foreign | something else is named; foreign: anything is, as all there is |
-| extra | single | the cause is named, and another beside it |
-| unnamed | single, double | a gap is seen, no cause named |
-| missed | single, double, foreign | nothing is seen |
-| alarm | clean | something is seen |
-| undecided | all | said to be unidentifiable |
-| failed | all | there is no answer: it crashed or took too long |
-| skipped | all | it cannot be asked about such simulators; counts nowhere |
+| wrong | single, double, foreign | another effect is named; foreign: an effect as full explanation
+|
+| extra | single | the cause is named, and another one in addition |
+| unnamed | single, double | a discrepancy is detected, no cause named |
+| missed | single, double, foreign | nothing is detected |
+| alarm | clean | a discrepancy is detected |
+| undecided | all | the verdict is unidentifiable |
+| failed | all | there is no answer: the diagnoser crashed or took too long |
+| skipped | all | the diagnoser does not support the simulator; not counted |
 """
 
 from __future__ import annotations
@@ -28,20 +31,22 @@ from bench.diagnosis.worlds.questions import coefficients_of, same_class
 Sets = list[tuple[str, ...]]
 Judged = tuple[str, int, int]
 Holds = Callable[[str, tuple[str, ...]], bool]
-MOST = 2  # a cause counts as found within a set of at most so many
+MOST = 2  # maximum size of a set in which a cause counts as identified
 
 
 @dataclass(frozen=True)
 class Mark:
-    """What an answer is worth.
+    """Grade of an answer.
 
     Attributes:
         outcome: see this module.
-        set_size: effects in the set that holds the truth (the larger of two); 0 where none does.
-        class_size: the same, with effects that are equivalent in any data counted as one.
-        named: what was named, alternatives behind a bar: ``drag.linear|wind + force.bias``.
-        covered: by coefficient or parameter of what was answered rightly: whether the 95 % interval
-            holds the truth; None where the interval is open.
+        set_size: number of effects in the set that contains the truth (the larger of two); 0 if
+            none does.
+        class_size: number of effects in that set, with effects that are equivalent in any data
+            counted as one.
+        named: named causes, alternatives separated by bars: ``drag.linear|wind + force.bias``.
+        covered: for each coefficient or parameter of a correct answer, whether the 95 % interval
+            contains the truth; None if the interval is open.
     """
 
     outcome: str
@@ -52,19 +57,24 @@ class Mark:
 
     @property
     def found(self) -> bool:
-        """Whether it counts, by names."""
+        """Whether the cause is named alone or in a set of at most `MOST` effects."""
         return self.outcome == "right" or (self.outcome == "set" and self.set_size <= MOST)
 
     @property
     def found_class(self) -> bool:
-        """Whether it counts, equivalent effects being one."""
+        """Whether the cause is named alone or in a small set, equivalent effects counted once."""
         return self.outcome == "right" or (
             self.outcome in ("set", "class") and self.class_size <= MOST
         )
 
 
 def marked(item: Item, verdict: Mapping[str, Any] | None) -> Mark:
-    """Mark one answer; a verdict of None is no answer."""
+    """Grade one answer.
+
+    Args:
+        item: the case with its truth.
+        verdict: the answer as a dictionary; None for a missing answer.
+    """
     if verdict is None:
         return Mark("failed", 0, 0, "", {})
     sets = [(cause["effect"], *cause["alternatives"]) for cause in verdict["causes"]]
@@ -90,10 +100,13 @@ def _foreign(item: Item, verdict: str, sets: Sets) -> Judged:
 
 
 def _library(item: Item, verdict: str, sets: Sets) -> Judged:
-    """One or two effects of the library: every one in a set of its own, and no set without one."""
+    """Grade an answer on one or two effects of the library.
+
+    An answer is right if each effect is in a set of its own and no set is without an effect.
+    """
     if verdict == "adequate":
         return "missed", 0, 0
-    if not sets or verdict == "unknown":  # what it lists then are no answers
+    if not sets or verdict == "unknown":  # effects listed with the verdict "unknown" are not named
         return "unnamed", 0, 0
     strict = _matched(item.effects, sets, lambda effect, names: effect in names)
     loose = _matched(
@@ -106,14 +119,21 @@ def _library(item: Item, verdict: str, sets: Sets) -> Judged:
     if len(sets) > len(item.effects):
         return "extra", sizes, classes
     if len(strict) < len(item.effects):
-        return "class", 0, classes  # only something equivalent is named
+        return "class", 0, classes  # only equivalent effects are named
     sizes = max(len(sets[place]) for place in strict.values())
     return "right" if sizes == 1 else "set", sizes, classes
 
 
 def _matched(effects: Iterable[str], sets: Sets, holds: Holds) -> dict[str, int]:
-    """Which set holds which effect, no set two: the fullest of the assignments, of two effects at
-    most.
+    """Assign effects to sets, each set to at most one effect.
+
+    Args:
+        effects: the hidden effects, at most two.
+        sets: the named sets.
+        holds: returns whether a set contains an effect.
+
+    Returns:
+        Index of the set of each effect, for the assignment with the most effects.
     """
     best: dict[str, int] = {}
     for order in (list(effects), list(effects)[::-1]):
@@ -136,8 +156,9 @@ def _same(item: Item, effect: str) -> frozenset[str]:
 
 
 def _classes(item: Item, names: Sequence[str]) -> int:
-    """Names of a set, equivalent ones as one; a robot's family adds nothing to one of its places
-    that stands beside it.
+    """Count the distinct names of a set, equivalent effects counted as one.
+
+    The family of an effect (``effect@*``) is not counted if the set contains one of its places.
     """
     placed = {name.partition("@")[0] for name in names if not name.endswith("@*")}
     counted = [n for n in names if not n.endswith("@*") or n.partition("@")[0] not in placed]
@@ -148,7 +169,7 @@ OUTCOMES = {"clean": _clean, "foreign": _foreign, "single": _library, "double": 
 
 
 def _covered(item: Item, verdict: Mapping[str, Any], sets: Sets) -> dict[str, bool | None]:
-    """Intervals of base parameters and of the coefficients of what leads its set."""
+    """Compare the intervals of base parameters and of leading causes with the truth."""
     truth, said = dict(item.parameters), dict(verdict["parameters"])
     led = {names[0] for names in sets}
     for cause in verdict["causes"]:
@@ -158,7 +179,7 @@ def _covered(item: Item, verdict: Mapping[str, Any], sets: Sets) -> dict[str, bo
                 truth[f"{cause['effect']}.{name}"] = value
                 said[f"{cause['effect']}.{name}"] = cause["coefficients"].get(name)
     if not set(item.effects) <= led:
-        return {}  # the parameters that go with something else are others
+        return {}  # parameters fitted together with a wrong cause are not comparable
     return {name: _holds(said[name], value) for name, value in truth.items() if said.get(name)}
 
 

@@ -1,4 +1,4 @@
-"""Writes tables and figures of a comparison of diagnosers, and says what came out."""
+"""Write the tables, figures and HTML report of a comparison of diagnosers and print a summary."""
 
 from __future__ import annotations
 
@@ -26,34 +26,44 @@ from bench.store.folder import Configuration
 from sims.files import write
 
 ITEMS = "items.csv"
-"""A row an answer."""
+"""File with one row per answer."""
 
 
 class Asked(Protocol):
-    """What is reported: the answers of a study; see `bench.diagnosis.study.DiagnosisStudy`."""
+    """Protocol of the studies that can be reported; see `bench.diagnosis.study.DiagnosisStudy`."""
 
     folder: Path
     configuration: Configuration
 
     @property
     def answered(self) -> Answered:
-        """All that was answered."""
+        """All stored answers."""
 
     @property
     def questions(self) -> list[Question]:
-        """The sheet."""
+        """All cases of the experiment."""
 
     @property
     def usable(self) -> list[str]:
-        """Diagnosers that can be used here."""
+        """Names of the diagnosers that can be used here."""
 
     @property
     def skipped(self) -> dict[str, str]:
-        """The others, and why."""
+        """Diagnosers that cannot be used here, with the reason."""
 
 
 def finish(study: Asked, say: Callable[[str], None]) -> int:
-    """Write what there is; how many answers failed."""
+    """Write tables, figures and HTML report from the answers that exist.
+
+    Only cases that every diagnoser has answered are reported.
+
+    Args:
+        study: the study to report.
+        say: prints one line.
+
+    Returns:
+        Number of failed answers.
+    """
     for name, reason in study.skipped.items():
         say(f"skipped: {name}: {reason}")
     order = study.usable
@@ -107,11 +117,11 @@ def finish(study: Asked, say: Callable[[str], None]) -> int:
 
 
 _FEW = 5
-"""Failures that are said."""
+"""Maximum number of failed answers that are printed."""
 
 
 def csv(frame: pd.DataFrame) -> str:
-    """A frame as the text of a file."""
+    """Format a table as CSV text."""
     text: str = frame.to_csv(index=False, float_format="%.6g", lineterminator="\n")
     return text
 
@@ -122,7 +132,17 @@ def draw(
     tables: Mapping[str, pd.DataFrame],
     order: Sequence[str],
 ) -> dict[str, Pictures]:
-    """Every figure that there is something to draw of, by name."""
+    """Draw every figure for which there is data.
+
+    Args:
+        experiment: the experiment, for the title.
+        rows: one row per answer.
+        tables: tables by name.
+        order: names of the diagnosers, in the order of their colours.
+
+    Returns:
+        Figures by name.
+    """
     title = experiment.title or experiment.name
     made = {}
     counted = (by_diagnoser(tables["table"], what) for what in ("false alarms", "named, alone"))
@@ -139,7 +159,16 @@ def draw(
 
 
 def text(tables: Mapping[str, pd.DataFrame], order: Sequence[str]) -> list[str]:
-    """The board as lines: alarms, naming, pairs, foreign causes, cost."""
+    """Format the leaderboard as aligned text lines.
+
+    Args:
+        tables: tables by name.
+        order: names of the diagnosers.
+
+    Returns:
+        A header line and one line per diagnoser with its false alarms, diagnosed single causes,
+        pairs, unmodelled causes and median cost.
+    """
     columns = (
         ("false alarms", "false alarms"),
         ("named, alone", "named alone"),

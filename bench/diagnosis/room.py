@@ -1,7 +1,7 @@
-"""One question asked of several diagnosers, each in a process of its own; runs in a worker.
+"""Evaluation of one case with several diagnosers, each in its own process; runs in a worker.
 
-The worker draws the question and writes its recording; a diagnoser's process gets the recording's
-two texts through a pipe, and nothing else.
+The worker draws the case and writes its recording. The process of a diagnoser receives the texts of
+the recording's files through a pipe, and nothing else.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from bench.sealing.wire import STATE_LIMIT, FoulError, packed, unpacked
 from sims.base import Array, InputError
 
 AHEAD = "bench.diagnosis.ahead"
-"""Loaded in the process that starts diagnosers."""
+"""Module that is preloaded in the fork server."""
 _ANSWER = 1 << 20
-"""Bytes that an answer may have."""
+"""Maximum size of an answer, bytes."""
 _REASON = 200
-"""Letters of why a diagnoser cannot be asked."""
+"""Maximum length of the reason why a diagnoser does not support a case, characters."""
 BUDGET = "it asked for more simulations than are allowed"
-"""The reason of an answer that was not given for that."""
+"""Reason of a missing answer when the diagnoser exceeded its simulation budget."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What one answer may cost.
+    """Limits of one answer.
 
     Attributes:
-        simulations: of simgap's simulators.
-        seconds: by the clock.
-        memory: MiB; 0 for no limit.
+        simulations: maximum number of simulations with simgap's simulators.
+        seconds: maximum elapsed time.
+        memory: maximum memory, MiB; 0 for no limit.
     """
 
     simulations: int
@@ -57,12 +57,12 @@ class Limits:
 
 @dataclass(frozen=True)
 class Examined:
-    """A diagnoser that is to be asked.
+    """Diagnoser that is evaluated.
 
     Attributes:
-        label: in tables.
+        label: name in tables.
         code: where its code is.
-        learned: files of what it has learned, by system.
+        learned: files with trained arrays, by system.
         trusted: whether it runs in this process.
     """
 
@@ -81,17 +81,20 @@ def answered(
     limits: Limits,
     hidden: tuple[str, ...],
 ) -> dict[str, Any]:
-    """The question's item, and a row for each diagnoser, as JSON.
+    """Draw a case and evaluate it with several diagnosers.
 
     Args:
-        question: as JSON.
-        seed: of the public questions.
-        salt: that questions are drawn from.
-        known: the item as JSON if it was drawn before, {} if it was found not to show, None if it
-            was not drawn.
-        examined: who is asked.
-        limits: of each answer.
-        hidden: folders that no diagnoser may reach.
+        question: case specification as JSON.
+        seed: seed of the public case set.
+        salt: salt from which cases are drawn.
+        known: the case as JSON if it was already drawn, {} if its cause was found to be
+            unobservable, None if it was not drawn yet.
+        examined: diagnosers to evaluate.
+        limits: limits of each answer.
+        hidden: folders that no diagnoser may read.
+
+    Returns:
+        JSON document with the name of the case, the case, and one row per diagnoser.
     """
     asked = Question.of(question)
     item = asked.drawn(seed, salt) if known is None else Item.of(known) if known else None
@@ -121,7 +124,7 @@ def _row(
     limits: Limits,
     hidden: tuple[str, ...],
 ) -> dict[str, Any]:
-    """How one diagnoser answered, or why it did not."""
+    """Run one diagnoser and return its row, with the reason if it gave no answer."""
     row: dict[str, Any] = {"question": question, "diagnoser": one.label, "trusted": one.trusted}
     learned = _learned(one.learned.get(given["system"]))
     begun = perf_counter()
@@ -143,7 +146,11 @@ def _reason(text: str) -> str:
 
 
 def _here(given: dict[str, Any], learned: Mapping[str, Array]) -> dict[str, Any]:
-    """The answer of a diagnoser that is trusted."""
+    """Run a trusted diagnoser in this process.
+
+    Raises:
+        EndedError: the diagnoser failed.
+    """
     with tempfile.TemporaryDirectory() as folder:
         try:
             return inside.asked(given, Path(folder), learned)
@@ -159,7 +166,11 @@ def _sealed(
     limits: Limits,
     hidden: tuple[str, ...],
 ) -> dict[str, Any]:
-    """The answer of a diagnoser in a process of its own, checked."""
+    """Run a diagnoser in an isolated process and validate its answer.
+
+    Raises:
+        EndedError: the diagnoser failed.
+    """
     robots = ("mujoco",) if given["beside"] else ()
     child = _started(code, limits.memory, hidden, robots)
     try:
@@ -184,7 +195,11 @@ def _sealed(
 
 
 def _checked(said: Any, limits: Limits) -> dict[str, Any]:
-    """What a diagnoser's process said, no more believed than it must be."""
+    """Validate the message of an isolated diagnoser.
+
+    Raises:
+        FoulError: the reported costs are impossible.
+    """
     simulations, seconds = int(said["simulations"]), float(said["processor_seconds"])
     if not 0 <= simulations <= limits.simulations or not 0 <= seconds < 1e9:
         raise FoulError("it said what it cannot have used")
@@ -200,7 +215,7 @@ def _started(
 ) -> Child:
     house = nursery()
     own = code.module.startswith("bench.")
-    # MuJoCo starts a process while it is imported, which no diagnoser may.
+    # MuJoCo starts a process while it is imported, which an isolated diagnoser must not do.
     house.load([AHEAD, *more, *code.modules, *([code.module] if own and not code.file else [])])
     files = [code.file] if code.file else []
     child = house.start("bench.diagnosis.inside:serve", files, memory, hidden)
@@ -213,7 +228,7 @@ def _started(
 
 
 def _learned(path: Path | None) -> dict[str, Array]:
-    """Arrays that were learned; none where there is no file."""
+    """Load trained arrays; return an empty dictionary if there is no file."""
     if path is None:
         return {}
     with np.load(path, allow_pickle=False) as arrays:
@@ -223,17 +238,20 @@ def _learned(path: Path | None) -> dict[str, Array]:
 def taught(
     code: Tuned, lesson: dict[str, Any], seconds: float, hidden: tuple[str, ...], trusted: bool
 ) -> tuple[dict[str, Array], int, float]:
-    """What a diagnoser learns for a system; the simulations and seconds that it took.
+    """Train a diagnoser for a system, in an isolated process unless it is trusted.
 
     Args:
         code: where its code is.
-        lesson: ``wanted``, ``system``, ``budget``, ``seed``.
-        seconds: that it may take.
-        hidden: folders that it may not reach.
+        lesson: request with ``wanted``, ``system``, ``budget`` and ``seed``.
+        seconds: maximum time.
+        hidden: folders that the diagnoser must not read.
         trusted: whether it runs in this process.
 
+    Returns:
+        The trained arrays, the number of simulations and the seconds used.
+
     Raises:
-        EndedError: it failed.
+        EndedError: the training failed.
     """
     begun = perf_counter()
     if trusted:

@@ -1,4 +1,4 @@
-"""A row for each answer: the question with its truth, what was said, and what that is worth."""
+"""Result rows: one row per answer with its case, truth, answer and grade."""
 
 from __future__ import annotations
 
@@ -12,29 +12,40 @@ from bench.diagnosis.marks import marked
 from bench.diagnosis.worlds.item import Item
 
 OF_ITEM = ("noise", "stated", "rate", "seconds", "runs", "source", "driven", "size", "beyond")
-"""What of an item stands in a row."""
+"""Attributes of a case that are columns of a result row."""
 SKIPPED = "skipped"
-"""Status and outcome where a diagnoser cannot be asked at all."""
+"""Status and outcome of a case that the diagnoser does not support."""
 OWN_SECONDS = "run_seconds"
-"""The column of a run's length, which `seconds` of an answer would hide."""
+"""Column of the length of a run; the column `seconds` is the time of an answer."""
 
 
 def rows_of(answered: Answered, diagnosers: Sequence[str]) -> pd.DataFrame:
-    """A row for each answer, in the order of diagnosers and then of questions."""
+    """Build the result rows, ordered by diagnoser and then by case.
+
+    Args:
+        answered: stored answers.
+        diagnosers: names of the diagnosers.
+    """
     rows = [row for name in diagnosers for row in _of(name, answered)]
     return pd.DataFrame(rows)
 
 
 def _of(diagnoser: str, answered: Answered) -> Iterator[dict[str, Any]]:
     for question, one in sorted(answered.items()):
-        # Not drawn, or lost before it was.
+        # The case could not be drawn, or its worker was lost before it was drawn.
         if "effects" not in one["item"] or diagnoser not in one["rows"]:
             continue
         yield row(question, Item.of(one["item"]), one["rows"][diagnoser])
 
 
 def row(question: str, item: Item, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The row of one answer."""
+    """Build the result row of one answer.
+
+    Args:
+        question: name of the case.
+        item: the case with its truth.
+        given: stored answer of one diagnoser.
+    """
     answer = given["answer"]
     mark = marked(item, answer)
     held = [holds for holds in mark.covered.values() if holds is not None]

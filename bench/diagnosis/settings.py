@@ -1,4 +1,4 @@
-"""What an experiment of diagnosers asks, as its ``[diagnosis]`` table says it."""
+"""The ``[diagnosis]`` table of an experiment: diagnosers and cases."""
 
 from __future__ import annotations
 
@@ -14,25 +14,28 @@ from sims.base import InputError
 from sims.user_toml import entries, fault, hints_of, known
 
 LARGEST = 30.0
-"""Sizes up to which effects are hidden, in units of the noise."""
+"""Maximum size of a hidden effect, in units of the noise."""
 _MOST = 10_000
-"""Questions of an experiment at most."""
+"""Maximum number of cases per combination of conditions."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Questions of one sort.
+    """Specification of cases of one kind.
+
+    Every combination of the listed values is used. A field that is empty is drawn at random, except
+    effects: they are then all effects that can be hidden.
 
     Attributes:
         kind: clean, single, double or foreign.
-        systems: each of them.
-        effects: each of them; empty for all that can be hidden. Of double and clean questions
-            none: what is hidden is drawn.
-        sizes: each of them, in units of the noise; empty for one that is drawn.
-        rates: each of them, Hz; empty for one that is drawn.
-        runs: likewise, numbers of runs.
-        noises: likewise, white, ar1 or quantised.
-        count: how many of each combination.
+        systems: names of the systems.
+        effects: hidden effects; empty for all that can be hidden. Not allowed for clean and double
+            cases, whose effects are drawn.
+        sizes: sizes of the hidden effect, in units of the noise.
+        rates: sampling rates, Hz.
+        runs: numbers of runs.
+        noises: kinds of noise: white, ar1 or quantised.
+        count: number of cases per combination.
     """
 
     kind: str
@@ -50,10 +53,10 @@ class Settings:
     """The ``[diagnosis]`` table.
 
     Attributes:
-        diagnosers: registered names.
-        seed: of the public questions; another one gives another exam of the same form.
-        sample: ask only so many of the questions, chosen at random; 0 for all.
-        questions: what is asked.
+        diagnosers: registered names of diagnosers.
+        seed: seed of the public cases; another seed gives another case set of the same form.
+        sample: number of cases that are selected at random; 0 for all.
+        questions: tables that specify the cases.
     """
 
     diagnosers: tuple[str, ...] = ()
@@ -63,7 +66,7 @@ class Settings:
 
     @property
     def asked(self) -> tuple[Asked, ...]:
-        """The questions, checked."""
+        """Case specifications, with validated keys."""
         return tuple(
             Asked(**entries("experiment", "diagnosis.questions", one, hints_of(Asked)))
             for one in self.questions
@@ -71,10 +74,10 @@ class Settings:
 
 
 def settings_of(experiment: Experiment) -> Settings:
-    """The table of an experiment.
+    """Read and validate the ``[diagnosis]`` table of an experiment.
 
     Raises:
-        InputError: a key or value that it cannot have.
+        InputError: a key or value is not allowed.
     """
     who = f"experiment {experiment.name}"
     given = entries(who, "diagnosis", dict(experiment.diagnosis), hints_of(Settings))

@@ -1,8 +1,7 @@
-"""The sheet of questions that an experiment asks: what is hidden in which circumstances, and the
-seed from which all else is drawn.
+"""Set of the cases that an experiment evaluates: hidden cause, conditions and seed of each.
 
-With the public salt a question's seed is a small number that everybody knows. With a secret one it
-is a part of a hash of salt and question, which says nothing of either.
+With the public salt, the seed of a case is a small number that everybody can compute. With a secret
+salt, it is a part of a hash of salt and case name, which reveals neither.
 """
 
 from __future__ import annotations
@@ -23,22 +22,22 @@ from sims import effects as library
 from sims.base import InputError, unknown
 
 ATTEMPTS = 8
-"""Drawings of one question, if what is drawn cannot show what it hides."""
+"""Maximum number of attempts to draw a case in which the hidden cause is observable."""
 _APART = 1000
-"""Seeds of two public exams of one form are so far apart, and those of two questions ten."""
+"""Difference between the first seeds of two public case sets; seeds of two cases differ by ten."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """What to draw.
+    """Specification from which a case is drawn.
 
     Attributes:
         kind: clean, single, double or foreign.
-        system: its name.
-        effect: what is hidden; of two the first; None where it is drawn.
-        size: in units of the noise; None where it is drawn.
-        asked: circumstances that are not drawn.
-        index: tells questions of one sort apart.
+        system: name of the system.
+        effect: hidden effect (the first one of a double case); None to draw it.
+        size: size of the effect in units of the noise; None to draw it.
+        asked: recording conditions that are specified and not drawn.
+        index: number that distinguishes cases of the same specification.
     """
 
     kind: str
@@ -50,7 +49,7 @@ class Question:
 
     @property
     def name(self) -> str:
-        """Unique in a sheet."""
+        """Name of the case, unique in a case set."""
         words = [self.kind, self.system]
         words += [self.effect] if self.effect else []
         words += [f"{self.size:g}"] if self.size else []
@@ -58,20 +57,23 @@ class Question:
         return "/".join([*words, str(self.index)])
 
     def json(self) -> dict[str, Any]:
-        """As plain values."""
+        """Convert to plain values for JSON."""
         return asdict(self)
 
     @classmethod
     def of(cls, document: dict[str, Any]) -> Question:
-        """A question from its JSON."""
+        """Restore a case specification from its JSON document."""
         return cls(**{**document, "asked": Circumstances(*document["asked"])})
 
     def drawn(self, seed: int, salt: str = PUBLIC) -> Item | None:
-        """The first of several drawings that shows what it hides; None where none does.
+        """Draw the case; make several attempts if the hidden cause is not observable.
 
         Args:
-            seed: of the public questions.
-            salt: secret, or `PUBLIC`.
+            seed: seed of the public case set.
+            salt: secret salt, or `PUBLIC`.
+
+        Returns:
+            The first case whose hidden cause is observable; None if all attempts fail.
         """
         first = self._first(seed, salt)
         items = (
@@ -84,22 +86,25 @@ class Question:
         if salt in ("", PUBLIC):
             return _APART * seed + 10 * self.index
         text = "\x1f".join([salt, self.name])
-        # Spaced, as the public ones are, for the further attempts.
+        # Multiples of ten, as for the public seeds, leave room for the seeds of further attempts.
         return 10 * int(hashlib.sha256(text.encode()).hexdigest()[:14], 16)
 
 
 def sheet(settings: Settings) -> list[Question]:
-    """All questions, in an order that does not depend on the table's.
+    """Build the list of all cases of a comparison.
+
+    The order of the tables in the experiment determines the order of the cases; with `sample`, a
+    random subset is selected.
 
     Raises:
-        InputError: an effect that a system cannot hide.
+        InputError: an effect cannot be hidden in a system.
     """
     numbers: dict[tuple[Any, ...], int] = {}
     questions = []
     for asked in settings.asked:
         for kind, system, effect, size, circumstances in _combined(asked):
             key = kind, system, effect, size, circumstances
-            # Sizes are no part of it: questions of two sizes are not of one draw.
+            # Sizes are not part of the key, so cases of two sizes have different seeds.
             for _ in range(asked.count):
                 group = kind, system, effect
                 numbers[group] = numbers.get(group, -1) + 1
@@ -126,7 +131,11 @@ def _combined(asked: Asked) -> Iterator[tuple[str, str, str | None, float | None
 
 
 def _effects(asked: Asked, system: str) -> list[str | None]:
-    """What questions hide; None where it is drawn."""
+    """List the effects that cases of one system hide; None stands for an effect that is drawn.
+
+    Raises:
+        InputError: an effect is unknown, or effects are named for clean or double cases.
+    """
     if asked.kind in ("clean", "double"):
         if asked.effects:
             raise InputError(f"diagnosis.questions: of {asked.kind} questions no effects are named")

@@ -1,6 +1,4 @@
-"""A comparison of diagnosers in its folder: questions are drawn, every diagnoser is asked each, and
-all that is said is kept and marked.
-"""
+"""Comparison of diagnosers in its result folder: draw cases, run diagnosers, store answers."""
 
 from __future__ import annotations
 
@@ -41,27 +39,27 @@ from sims.base import InputError
 
 Say = Callable[[str], None]
 ROOMS = ("sims", "bench/problem", "bench/runs", "bench/sealing", "bench/gap", "bench/recordings")
-"""Folders whose code makes answers, beside those of diagnosis itself."""
+"""Source folders that determine the answers, except those of the diagnosis benchmark itself."""
 OWN = (*ROOMS, "bench/diagnosis/worlds", "bench/diagnosers")
 LONGEST_LESSON = 3600.0
-"""Seconds that a diagnoser may learn for a system."""
+"""Maximum training time of a diagnoser for one system, seconds."""
 _DRAWING = 300.0
-"""Seconds that a question may take to be drawn."""
+"""Maximum time to draw one case, seconds."""
 
 
 class DiagnosisStudy:
-    """Questions x diagnosers, kept in a folder; fulfils `bench.study.Study`.
+    """Comparison of diagnosers on cases, stored in a folder; implements `bench.study.Study`.
 
     Args:
-        folder: of such a comparison.
+        folder: result folder of a comparison of diagnosers.
 
     Attributes:
-        folder: where everything lies.
-        configuration: what it is for.
-        plugins: plugin files that its diagnosers need.
+        folder: result folder.
+        configuration: stored configuration of the study.
+        plugins: plugin files that the diagnosers need.
 
     Raises:
-        InputError: it is no such folder, or it is damaged.
+        InputError: the folder does not contain such a comparison, or it is damaged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -79,7 +77,15 @@ class DiagnosisStudy:
         jobs: int = 2,
         salt: str | None = None,
     ) -> DiagnosisStudy:
-        """A comparison in a new folder; nothing has been asked yet; see `bench.study.Study`."""
+        """Create a comparison in a new folder, without running it; see `bench.study.Study`.
+
+        Args:
+            experiment: experiment with a ``[diagnosis]`` table.
+            plugins: plugin files that the diagnosers need.
+            folder: new result folder; None for the default one.
+            jobs: number of worker processes that will be used; 0 runs everything in this process.
+            salt: random string from which cases are drawn; see `bench.study.Study.begin`.
+        """
         settings = settings_of(experiment)
         new = begun(experiment, folder, jobs, salt)
         sheet(settings)
@@ -91,7 +97,12 @@ class DiagnosisStudy:
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> DiagnosisStudy:
-        """A comparison that was interrupted; see `bench.study.Study.resume`."""
+        """Open an interrupted comparison in order to run it; see `bench.study.Study.resume`.
+
+        Args:
+            folder: result folder.
+            plugins: further plugin files.
+        """
         study = cls(folder)
         held = study.configuration
         given = {str(Path(p).resolve()) for p in plugins}
@@ -104,19 +115,20 @@ class DiagnosisStudy:
 
     @cached_property
     def settings(self) -> Settings:
-        """The [diagnosis] table."""
+        """The validated ``[diagnosis]`` table."""
         return settings_of(self.configuration.experiment)
 
     @cached_property
     def questions(self) -> list[Question]:
-        """The sheet."""
+        """All cases of the experiment."""
         return sheet(self.settings)
 
     @cached_property
     def skipped(self) -> dict[str, str]:
-        """Diagnosers that cannot be used here, by name, and why."""
+        """Diagnosers that cannot be used here, by name, with the reason."""
         reasons = {}
-        # A plugin's is known where its file was loaded: who only reads the folder needs none.
+        # A diagnoser of a plugin is registered only where the plugin was loaded. Reading the folder
+        # does not require the plugin, so an unregistered name is no reason to skip.
         known = set(diagnosers.names())
         for name in self.settings.diagnosers:
             if name not in known:
@@ -129,13 +141,19 @@ class DiagnosisStudy:
 
     @property
     def usable(self) -> list[str]:
-        """Diagnosers that can be used here."""
+        """Names of the diagnosers that can be used here."""
         return [name for name in self.settings.diagnosers if name not in self.skipped]
 
     def make(
         self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
     ) -> Made:
-        """Ask what has not been asked; see `bench.study.Study.make`."""
+        """Collect the missing answers; see `bench.study.Study.make`.
+
+        Args:
+            jobs: number of worker processes.
+            progress: makes progress callbacks; None for no progress output.
+            pool: worker pool; None to create one.
+        """
         self._kept = Kept(self.folder)
         try:
             _Asking(self, self._kept, progress or silent).run(jobs, pool)
@@ -156,18 +174,18 @@ class DiagnosisStudy:
         return Made(len(ends) - missing, len(ends), **why)
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Close the answer file and release its lock."""
         if self._kept is not None:
             self._kept.close()
             self._kept = None
 
     @property
     def answered(self) -> Answered:
-        """All that was answered, by question."""
+        """All stored answers, by case."""
         return read(self.folder)
 
     def status(self) -> Standing:
-        """Which answers the folder holds and which are missing."""
+        """Return which answers are stored and which are missing."""
         held = self.answered
         ends = []
         for question in self.questions:
@@ -188,8 +206,13 @@ class DiagnosisStudy:
         return Standing(name, "answers given", configured.fingerprint, tuple(ends))
 
     def finish(self, say: Say) -> int:
-        """Write tables and figures of what there is, and say what came out; how many answers
-        failed.
+        """Write tables, figures and HTML report, and print a summary.
+
+        Args:
+            say: prints one line.
+
+        Returns:
+            Number of failed answers.
         """
         from bench.diagnosis.report import finish
 
@@ -197,7 +220,7 @@ class DiagnosisStudy:
 
 
 class _Asking:
-    """The work on the questions that are open."""
+    """Execution of the cases that have missing answers."""
 
     def __init__(self, study: DiagnosisStudy, kept: Kept, progress: Progress) -> None:
         self._study, self._kept, self._progress = study, kept, progress
@@ -209,15 +232,20 @@ class _Asking:
         )
 
     def run(self, jobs: int, pool: Pool | None) -> None:
-        """Have diagnosers learn, and ask them.
+        """Train the diagnosers and collect the missing answers.
+
+        Args:
+            jobs: number of worker processes.
+            pool: worker pool; None to create one.
 
         Raises:
-            LostError: what makes the calls is gone.
+            LostError: the workers are no longer available.
         """
         open_questions = [q for q in self._mixed() if self._open(q)]
         if not open_questions:
             return
-        # Here are the truths, and a diagnoser's process may be this user's.
+        # The truths are in the memory of this process, and a diagnoser's process may run as the
+        # same user.
         trusted = self._experiment.trusted
         with nullcontext() if trusted else memory_hidden(), pool or pool_of(jobs) as workers:
             examined, taught = self._learn(workers)
@@ -225,13 +253,13 @@ class _Asking:
             self._ask(workers, open_questions, examined)
 
     def _mixed(self) -> list[Question]:
-        """The questions in an order of chance: what there is at any time is a fair sample."""
+        """Return the cases in a fixed random order, so that a partial result is a fair sample."""
         questions = self._study.questions
         order = rng_for("diagnosis", "order", len(questions)).permutation(len(questions))
         return [questions[place] for place in order.tolist()]
 
     def _open(self, question: Question) -> list[str]:
-        """Diagnosers that have not answered a question."""
+        """Return the names of the diagnosers that have not answered a case."""
         one = self._kept.answered.get(question.name)
         if one is not None and not one["item"]:
             return []
@@ -239,9 +267,13 @@ class _Asking:
         return [name for name in self._study.usable if name not in rows]
 
     def _learn(self, workers: Pool) -> tuple[dict[str, Examined], list[Taught]]:
-        """Everybody who can be asked, and what learning cost."""
+        """Train the diagnosers.
+
+        Returns:
+            The diagnosers to evaluate, by name, and the costs of their training.
+        """
         trusted = self._experiment.trusted
-        # Of a robot nobody knows the file before it is asked about.
+        # The model file of a robot is not known before its case, so no diagnoser can train for it.
         wanted = {question.system for question in self._study.questions}
         systems = sorted(wanted & set(simulators.names()))
         codes = {name: code_of(name) for name in self._study.usable}
@@ -272,7 +304,7 @@ class _Asking:
                 files[name][system] = result.path
                 taught.append(Taught(name, system, result.simulations, result.seconds))
             elif isinstance(result, EndedError | TimeoutError):
-                # It is asked all the same, and says for itself what it lacks.
+                # An untrained diagnoser is evaluated all the same; its answer states what it lacks.
                 taught.append(Taught(name, system, 0, 0.0, str(result)))
             else:
                 raise result
@@ -301,7 +333,11 @@ class _Asking:
 
 
 def _lost(question: Question, labels: Sequence[str], error: BaseException) -> dict[str, Any]:
-    """The answers to a question whose worker died or took too long: none was given."""
+    """Make failed answers for a case whose worker died or exceeded its time limit.
+
+    Raises:
+        InputError: the worker failed with this error.
+    """
     if isinstance(error, InputError):
         raise error
     status = "timeout" if isinstance(error, TimeoutError) else "crashed"
@@ -323,21 +359,21 @@ def _lost(question: Question, labels: Sequence[str], error: BaseException) -> di
 
 
 def code_of(name: str) -> Tuned:
-    """Where a diagnoser's code is, and what may be loaded ahead of it."""
+    """Return the code location of a diagnoser and the modules to preload for it."""
     kind, place = diagnosers.get(name), diagnosers.place(name)
     module = getattr(kind, "module", "") or kind.__module__
     file = str(place) if place else ""
     own = importlib.util.find_spec(module) if module.startswith("bench.") else None
-    # Packages that are imported where they are needed would be imported anew for each answer.
+    # Without preloading, packages that a diagnoser imports would be imported again for each answer.
     ahead = ahead_of(file or (own.origin or "" if own else "")) if file or own else ()
     return Tuned(name, module, file, {}, ahead)
 
 
 def _refuse_unreachable(names: Sequence[str]) -> None:
-    """Refuse diagnosers that exist in this process alone, if worker processes are to ask them.
+    """Reject diagnosers that exist in this process alone: worker processes cannot load them.
 
     Raises:
-        InputError: one is a class of a script or a notebook.
+        InputError: a diagnoser is a class of a script or notebook.
     """
     for name in names:
         added = diagnosers.snapshot().get(name)
@@ -346,10 +382,14 @@ def _refuse_unreachable(names: Sequence[str]) -> None:
 
 
 def _announced(name: str, trusted: bool) -> None:
-    """Find out about a diagnoser of another package before anybody imports it here.
+    """Register a stub for a diagnoser of another package, without importing its code here.
+
+    Args:
+        name: registered name of the diagnoser.
+        trusted: whether diagnosers run in this process.
 
     Raises:
-        InputError: there is none of this name, or its code is in this process already.
+        InputError: the diagnoser does not exist, or its code is already in this process.
     """
     if not trusted and foreign(name, diagnosers):
         try:
@@ -369,7 +409,11 @@ def _announced(name: str, trusted: bool) -> None:
 
 
 def _fingerprint(experiment: Experiment, plugins: Sequence[str]) -> dict[str, str]:
-    """Hashes of what must not change while it is made, by what a person would call it."""
+    """Compute hashes of everything that must not change while the study is incomplete.
+
+    Returns:
+        Hashes by a description for the user.
+    """
     public = experiment.chosen(salt="") if experiment.salt_sha256 else experiment
     sources = []
     for name in settings_of(experiment).diagnosers:

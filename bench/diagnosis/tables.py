@@ -1,9 +1,10 @@
-"""Tables of a comparison of diagnosers: rows of answers in, frames out.
+"""Tables of a comparison of diagnosers, computed from one row per answer.
 
-Shares of alarms have Clopper and Pearson's 95 % intervals (Biometrika 26, 404, 1934), which hold
-their level however rare an alarm is; other shares have Wilson's (J. Am. Stat. Assoc. 22, 209,
-1927). Two diagnosers are compared question by question, by McNemar's exact test (Psychometrika 12,
-153, 1947), all pairs with simgap's own together by Holm's rule (Scand. J. Stat. 6, 65, 1979).
+Fractions of false alarms and of missing answers have 95 % intervals of Clopper and Pearson
+(Biometrika 26, 404, 1934), which keep their level for rare events too; other fractions have 95 %
+intervals of Wilson (J. Am. Stat. Assoc. 22, 209, 1927). Two diagnosers are compared on the same
+cases by McNemar's exact test (Psychometrika 12, 153, 1947); all pairs with simgap are corrected
+together by Holm's method (Scand. J. Stat. 6, 65, 1979).
 """
 
 from __future__ import annotations
@@ -15,25 +16,34 @@ import numpy as np
 import pandas as pd
 
 AT_LEAST = 1.0
-"""Size in units of the noise from which an effect has to be named."""
+"""Minimum size of an effect that must be diagnosed, in units of the noise."""
 LEVELS = (0.01, 0.05, 0.1, 0.2, 0.5)
-"""At which p values of recordings without anything hidden are counted."""
+"""Significance levels at which p-values of clean recordings are counted."""
 OWN = "simgap"
-"""With which the others are compared."""
+"""Diagnoser with which all others are compared."""
 SETS = ((1, 1), (2, 2), (3, 4), (5, 10**6))
-"""Sizes of sets that are counted together."""
+"""Bins of set sizes, as inclusive (low, high)."""
 SETS_SAID = ("1", "2", "3 to 4", "5 or more")
-"""The same in words."""
+"""Labels of the bins of set sizes."""
 
 NAMED = "the same, up to equivalence"
-"""The metric that counts as named: alone or in a set of at most two, equivalent effects as one."""
+"""Primary metric: cause named alone or in a set of at most two, equivalent effects counted once."""
 
 Of = Callable[[pd.DataFrame], pd.DataFrame]
 Right = Callable[[pd.DataFrame], "pd.Series[bool]"]
 
 
 def share(hits: int, of: int, exact: bool = False) -> dict[str, Any]:
-    """A share with its 95 % interval."""
+    """Compute a fraction with its 95 % interval.
+
+    Args:
+        hits: number of successes.
+        of: number of trials.
+        exact: whether to use the Clopper-Pearson interval instead of Wilson's.
+
+    Returns:
+        The keys count, of, share, low and high; the last three are NaN without trials.
+    """
     from scipy.stats import binomtest
 
     if not of:
@@ -44,17 +54,17 @@ def share(hits: int, of: int, exact: bool = False) -> dict[str, Any]:
 
 
 def singles(rows: pd.DataFrame) -> pd.DataFrame:
-    """One hidden effect that has to be named."""
+    """Select cases with one hidden effect that is large enough to be diagnosed."""
     return rows[(rows["kind"] == "single") & (rows["size"] >= AT_LEAST)]
 
 
 def clean(rows: pd.DataFrame) -> pd.DataFrame:
-    """Nothing hidden."""
+    """Select cases without a hidden cause."""
     return rows[rows["kind"] == "clean"]
 
 
 def _within(rows: pd.DataFrame) -> pd.Series[bool]:
-    """The cause stands in a set of any size, or alone; nothing besides is named."""
+    """Return whether the cause is in a named set of any size and no other cause is named."""
     return rows["outcome"].isin(("right", "set"))
 
 
@@ -74,11 +84,16 @@ METRICS: tuple[tuple[str, Callable[[pd.DataFrame], pd.DataFrame], Right, bool], 
     ),
     ("without an answer", lambda rows: rows, lambda rows: rows["status"] != "done", True),
 )
-"""What is counted: name, of which rows, what counts, whether its interval is exact."""
+"""Metrics: name, row filter, success predicate, and whether to use the Clopper-Pearson interval."""
 
 
 def table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Every metric of every diagnoser, long."""
+    """Build the table of all metrics, one row per diagnoser and metric.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+    """
     lines = []
     for name in order:
         own = rows[rows["diagnoser"] == name]
@@ -92,7 +107,12 @@ def table(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
 
 
 def groups(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Naming and alarms by system, noise, whether it is stated, rate, runs, source and effect."""
+    """Build the table of false alarms and diagnosed causes by recording condition and effect.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+    """
     lines = []
     keys = ("system", "noise", "stated", "rate", "runs", "source", "driven")
     asked: tuple[tuple[str, Of, Right, tuple[str, ...], bool], ...] = (
@@ -118,7 +138,12 @@ def groups(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
 
 
 def power(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """What is named and what is seen of single effects, by their size."""
+    """Build the table of diagnosed and detected single effects by size.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+    """
     lines = []
     for name in order:
         own = rows[(rows["diagnoser"] == name) & (rows["kind"] == "single")]
@@ -130,7 +155,12 @@ def power(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
 
 
 def confusion(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """How often what was hidden was taken for what: the leading name of the first cause."""
+    """Count the leading name of the first diagnosed cause for each hidden cause.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+    """
     asked = rows[(rows["kind"] != "double") & rows["diagnoser"].isin(order)].copy()
     hidden = asked["hidden"].where(asked["kind"] == "single", "(" + asked["kind"] + ")")
     asked["hidden"] = hidden
@@ -148,8 +178,14 @@ def _said(verdict: str, named: str) -> str:
 
 
 def calibration(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Of diagnosers that give p values: how often these are at most a level where nothing is
-    hidden, which should be the level itself.
+    """Build the calibration table of p-values on clean recordings.
+
+    It gives the fraction of clean recordings whose p-value is at most a level; for a calibrated
+    p-value this fraction equals the level. Diagnosers without p-values are omitted.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
     """
     lines = []
     for name in order:
@@ -165,7 +201,12 @@ def calibration(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
 
 
 def sets(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Answers about single effects by the size of their largest set; how many hold the truth."""
+    """Count answers about single effects, and those that contain the truth, by largest set size.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+    """
     lines = []
     for name in order:
         own = singles(rows[rows["diagnoser"] == name])
@@ -180,7 +221,13 @@ def sets(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
 def costs(
     rows: pd.DataFrame, order: Sequence[str], training: Sequence[dict[str, str]]
 ) -> pd.DataFrame:
-    """What answers cost, and beside them what was learned from before."""
+    """Build the table of costs per answer and of training costs.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+        training: rows of training.csv.
+    """
     lines = []
     for name in order:
         own = rows[(rows["diagnoser"] == name) & (rows["status"] == "done")]
@@ -198,7 +245,12 @@ def costs(
 
 
 def pairs(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """Everybody against simgap's own, question by question."""
+    """Compare each diagnoser with simgap on the same cases, Holm-corrected within each metric.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+    """
     asked: tuple[tuple[str, Callable[[pd.DataFrame], pd.DataFrame], Right], ...] = (
         ("named", singles, lambda part: part["found_class"]),
         ("named, alone", singles, lambda part: part["outcome"] == "right"),
@@ -234,8 +286,11 @@ def pairs(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
 
 
 def mcnemar(ours: int, theirs: int) -> float:
-    """Exact two-sided probability of so unequal a split of the questions that one alone got
-    right.
+    """Compute the p-value of McNemar's exact test, two-sided.
+
+    Args:
+        ours: number of cases that only the first diagnoser answered correctly.
+        theirs: number of cases that only the second diagnoser answered correctly.
     """
     from scipy.stats import binomtest
 
@@ -245,7 +300,7 @@ def mcnemar(ours: int, theirs: int) -> float:
 
 
 def holm(chances: Sequence[float]) -> list[float]:
-    """Probabilities corrected for their number."""
+    """Correct p-values for multiple tests by Holm's method; the order is kept."""
     order = np.argsort(chances, kind="stable")
     corrected = np.ones(len(chances))
     highest = 0.0
@@ -259,7 +314,12 @@ Line = dict[str, Any]
 
 
 def by_diagnoser(frame: pd.DataFrame, metric: str = "") -> dict[str, Line]:
-    """The lines of a table by diagnoser, those of one metric where it is named."""
+    """Index the rows of a table by diagnoser.
+
+    Args:
+        frame: table with a column diagnoser.
+        metric: metric whose rows are used; empty for a table without a column metric.
+    """
     if metric:
         frame = frame[frame["metric"] == metric]
     lines = [{str(key): value for key, value in line.items()} for line in frame.to_dict("records")]
@@ -267,8 +327,11 @@ def by_diagnoser(frame: pd.DataFrame, metric: str = "") -> dict[str, Line]:
 
 
 def complete(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
-    """The questions that every diagnoser was asked: what is not finished compares like with
-    like.
+    """Select the cases that every diagnoser has answered, so that comparisons are fair.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
     """
     counts = rows.groupby("question")["diagnoser"].nunique()
     whole = counts.index[counts == len(order)]
@@ -279,7 +342,13 @@ def complete(rows: pd.DataFrame, order: Sequence[str]) -> pd.DataFrame:
 def all_tables(
     rows: pd.DataFrame, order: Sequence[str], training: Sequence[dict[str, str]]
 ) -> dict[str, pd.DataFrame]:
-    """Every table by the name of its file."""
+    """Build every table, by the name of its file.
+
+    Args:
+        rows: one row per answer.
+        order: names of the diagnosers.
+        training: rows of training.csv.
+    """
     return {
         "table": table(rows, order),
         "groups": groups(rows, order),

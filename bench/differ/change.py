@@ -1,4 +1,4 @@
-"""What differs between two settings, environments or other trees of plain values."""
+"""Differences between two settings, environments or other trees of plain values."""
 
 from __future__ import annotations
 
@@ -6,13 +6,21 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 ALPHA = 0.05
-"""Chance of any false alarm among all that is compared."""
+"""Familywise error rate: probability of any false alarm among all comparisons."""
 OF_A_MACHINE = ("simgap", "python", "platform", "machine", "stepping", "seals", "packages")
-"""Keys of an environment that may matter to what came out."""
+"""Keys of an environment that may influence the results."""
 
 
 def changes(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What differs, by dotted key: None where it is not there."""
+    """Find the differences between two trees of values.
+
+    Args:
+        a: first tree.
+        b: second tree.
+
+    Returns:
+        For each dotted key that differs, the values in both; None where the key does not exist.
+    """
     flat_a, flat_b = dict(_flat(a)), dict(_flat(b))
     return [
         {"what": key, "a": flat_a.get(key), "b": flat_b.get(key)}
@@ -32,14 +40,20 @@ def _flat(value: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any
 
 
 def of_machine(environment: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of an environment that may matter, with the hash of the code that made runs."""
+    """Select the part of an environment that may influence results, with the hash of the code."""
     told = {key: environment[key] for key in OF_A_MACHINE if key in environment}
     code = environment.get("fingerprint", {}).get("code")
     return {**told, **({"code": code} if code else {})}
 
 
 def side(folder: Any, name: str, environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Which of the two it is."""
+    """Describe one of the two compared results.
+
+    Args:
+        folder: its folder.
+        name: its name.
+        environment: its environment.
+    """
     return {
         "folder": folder,
         "name": name,
@@ -49,7 +63,12 @@ def side(folder: Any, name: str, environment: Mapping[str, Any]) -> dict[str, An
 
 
 def said(found: Iterable[Mapping[str, Any]], most: int = 12) -> list[str]:
-    """Changes in words, some of many."""
+    """Format changes as text lines, at most `most` of them.
+
+    Args:
+        found: the changes.
+        most: maximum number of changes.
+    """
     lines = [f"  {each['what']}: {_short(each['a'])} -> {_short(each['b'])}" for each in found]
     rest = len(lines) - most
     return [*lines[:most], *([f"  and {rest} more (--json has all)"] if rest > 0 else [])]
@@ -61,7 +80,7 @@ def _short(value: Any) -> str:
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Columns of words, the first three to the left."""
+    """Align columns of texts: the first three to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(
@@ -73,5 +92,5 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def number(value: float | None) -> str:
-    """Three digits, or a dash."""
+    """Format a number with three digits; None as a dash."""
     return "-" if value is None else f"{value:.3g}"

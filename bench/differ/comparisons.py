@@ -1,10 +1,10 @@
-"""Two comparisons side by side: which tuners' errors differ, and whether that is more than chance.
+"""Compare two tuner comparisons: which errors differ significantly.
 
-Errors are compared target by target where both runs met the same targets (the same truth and start;
-names alone say nothing, since every salt draws its own), each target by the mean over the seeds
-that both have: Wilcoxon's signed-rank test of the logarithms. Else the targets are two samples: the
-test of H. B. Mann, D. R. Whitney, Ann. Math. Stat. 18, 50, 1947. Holm's correction is over all
-lines.
+If both comparisons have the same targets (the same truth and start; names are not sufficient,
+because every salt draws its own targets), errors are compared target by target: Wilcoxon's
+signed-rank test of the logarithms of the mean over the common seeds. Otherwise the targets are two
+samples, and the test is that of H. B. Mann, D. R. Whitney, Ann. Math. Stat. 18, 50, 1947. Holm's
+correction is over all lines.
 """
 
 from __future__ import annotations
@@ -29,14 +29,21 @@ from bench.store.status import FAILURES
 from sims.base import Array, InputError
 
 MOMENTS = (3, 10)
-"""Numbers of simulations at which errors are compared, beside the last that both have."""
+"""Numbers of simulations at which errors are compared, in addition to the last common one."""
 _TARGET = ("true_", "recommendation_")
-"""Columns by which a target is known: its truth, and where its runs begin."""
+"""Prefixes of the columns that identify a target: its truth, and the start of its runs."""
 
 
 @dataclass(frozen=True)
 class Side:
-    """One of two comparisons."""
+    """One of two comparisons.
+
+    Attributes:
+        folder: its folder.
+        stored: its stored runs.
+        curves: its error curves by the compared metric.
+        targets: truth and start by name of the target.
+    """
 
     folder: Path
     stored: Stored
@@ -44,8 +51,16 @@ class Side:
     targets: pd.DataFrame
 
     def cells(self, kind: str, tuner: str, k: int) -> pd.Series[float]:
-        """Errors of a tuner after k simulations by (target, seed); infinite where the run
-        failed and has come to its end.
+        """Return the errors of a tuner after k simulations.
+
+        Args:
+            kind: range of the targets.
+            tuner: label of the tuner.
+            k: number of simulations.
+
+        Returns:
+            Errors by (target, seed); infinite if the run failed and has ended by then, or has no
+            error.
         """
         part = self.curves.of(range=kind, tuner=tuner)
         last = k >= part.values.shape[1] - 1
@@ -56,10 +71,14 @@ class Side:
 
 
 def opened(folder: Path, metric: str | None = None) -> Side:
-    """One of two comparisons; by the error that decides where no metric is named.
+    """Load one of two comparisons.
+
+    Args:
+        folder: its folder.
+        metric: error to compare; None for the deciding error of the comparison.
 
     Raises:
-        InputError: it is no comparison, or holds no runs, or none with the metric.
+        InputError: the folder has no comparison, no runs, or no runs with the metric.
     """
     stored = read(folder, [*NEEDED, *_target_columns(folder)])
     if stored.runs.empty:
@@ -78,7 +97,7 @@ def _target_columns(folder: Path) -> list[str]:
     from pyarrow import parquet
 
     path = folder / "runs.parquet"
-    # Whoever reads the folder says what is wrong with it.
+    # Errors of the folder are reported by the code that reads it.
     if not path.is_file():
         return []
     try:
@@ -89,11 +108,11 @@ def _target_columns(folder: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Compared:
-    """What differs between two comparisons.
+    """Differences between two comparisons.
 
     Attributes:
-        a: the first, from which changes are counted.
-        b: the second.
+        a: first comparison, from which changes are counted.
+        b: second comparison.
         metric: the deciding error.
     """
 
@@ -103,7 +122,7 @@ class Compared:
 
     @cached_property
     def errors(self) -> pd.DataFrame:
-        """A line a range, tuner and number of simulations, columns as in the schema ``diff``."""
+        """Table of errors, a line per range, tuner and number of simulations (schema ``diff``)."""
         lines = list(self._lines())
         if not lines:
             return pd.DataFrame()
@@ -157,7 +176,7 @@ class Compared:
 
     @cached_property
     def shared(self) -> set[str]:
-        """Targets that both have met: of the same truth, and with the same start."""
+        """Targets that both comparisons have, with the same truth and the same start."""
         a, b = self.a.targets, self.b.targets
         if list(a.columns) != list(b.columns):
             return set()
@@ -173,7 +192,7 @@ class Compared:
 
     @cached_property
     def statuses(self) -> list[dict[str, Any]]:
-        """How many runs of a tuner ended how, where that differs."""
+        """Numbers of runs by tuner and status that differ between the comparisons."""
         counts = [
             Counter(zip(s.stored.statuses["tuner"], s.stored.statuses["status"], strict=True))
             for s in (self.a, self.b)
@@ -187,7 +206,7 @@ class Compared:
 
     @cached_property
     def only(self) -> dict[str, list[str]]:
-        """Tuners that one of them has alone."""
+        """Tuners that only one of the comparisons has."""
         mine, other = (s.curves.tuners() for s in (self.a, self.b))
         return {
             "a": [t for t in mine if t not in other],
@@ -196,12 +215,12 @@ class Compared:
 
     @property
     def changed(self) -> bool:
-        """Whether an error differs significantly, or another share of the runs fails."""
+        """Whether an error differs significantly, or the fraction of failed runs differs."""
         return bool(len(self._significant())) or any(a != b for a, b in self._failing())
 
     @property
     def worse(self) -> bool:
-        """Whether an error has grown significantly, or a larger share of the runs fails."""
+        """Whether an error has grown significantly, or the fraction of failed runs has grown."""
         found = self._significant()
         grown = bool(len(found) and (found["ratio"] > 1).any())
         return grown or any(b > a for a, b in self._failing())
@@ -210,7 +229,7 @@ class Compared:
         return self.errors[self.errors["significant"]] if len(self.errors) else self.errors
 
     def _failing(self) -> Iterator[tuple[float, float]]:
-        """The share of runs that failed, of each tuner that both have."""
+        """Yield the fractions of failed runs in both comparisons, for each common tuner."""
         frames = [s.stored.statuses for s in (self.a, self.b)]
         for tuner in self.a.curves.tuners():
             if tuner not in self.only["a"]:
@@ -218,7 +237,11 @@ class Compared:
                 yield float(mine[0]), float(mine[1])
 
     def _telling(self) -> Iterator[str]:
-        """Statuses in words: failures, and the others where as many runs were made."""
+        """Yield changed status counts as text lines.
+
+        Counts other than failures are included only if both comparisons have the same number of
+        runs of the tuner.
+        """
         runs = [s.stored.statuses["tuner"].value_counts() for s in (self.a, self.b)]
         for each in self.statuses:
             tuner = each["tuner"]
@@ -227,7 +250,7 @@ class Compared:
 
     @cached_property
     def notes(self) -> list[str]:
-        """What to know before believing it."""
+        """Notes on limitations of the comparison."""
         notes = []
         found = self.errors
         if not len(found):
@@ -245,7 +268,7 @@ class Compared:
         return notes
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Convert to a JSON document."""
         experiments = [s.stored.experiment for s in (self.a, self.b)]
         environments = [environment(s.folder) for s in (self.a, self.b)]
         sides = [
@@ -267,7 +290,7 @@ class Compared:
         }
 
     def lines(self) -> Iterator[str]:
-        """A short account."""
+        """Format the differences as text lines."""
         document = self.document()
         head = ("range", "tuner", "", "simulations", "a", "b", "b / a", "targets", "p (Holm)")
         yield f"{self.metric}, median over targets; p of a difference, corrected for all lines"
@@ -305,12 +328,12 @@ class Compared:
         yield "something has changed" if self.changed else "nothing has changed significantly"
 
     def table(self) -> pd.DataFrame:
-        """For a CSV file."""
+        """Return the table for a CSV file."""
         return self.errors
 
 
 def _unpaired(a: Array, b: Array) -> tuple[float, float]:
-    """Ratio of the medians of b over a, and Mann and Whitney's p-value."""
+    """Compute the ratio of the medians of b over a, and the p-value of the Mann-Whitney test."""
     from scipy.stats import mannwhitneyu
 
     ratio = float(np.exp(np.clip(np.median(b) - np.median(a), -700, 700)))
@@ -318,17 +341,21 @@ def _unpaired(a: Array, b: Array) -> tuple[float, float]:
 
 
 def _least(targets: int, paired: bool) -> float:
-    """The least p-value that so many targets allow."""
+    """Compute the smallest p-value that is possible with a number of targets."""
     from math import comb
 
     return 2.0 / 2**targets if paired else 2.0 / comb(2 * targets, targets)
 
 
 def compare(a: Path, b: Path) -> Compared:
-    """Two comparisons side by side.
+    """Compare two comparisons.
+
+    Args:
+        a: folder of the first comparison.
+        b: folder of the second comparison.
 
     Raises:
-        InputError: one is none, or has nothing that the other could be compared with.
+        InputError: a folder has no comparison, or nothing that can be compared.
     """
     first = opened(a)
     metric = primary(first.stored.runs).metric

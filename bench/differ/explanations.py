@@ -1,10 +1,9 @@
-"""Two explanations side by side: verdict, causes, numbers, and whether a number has moved by more
-than both intervals allow.
+"""Compare two explanations: verdict, causes, and numbers that changed significantly.
 
-Half of a 95 % interval is 1.96 standard errors; the difference of two numbers has the root of both
-squares summed, if the two explanations are of different recordings. Of the same recording they are
-not independent, and the difference is known better than that: what is called significant is so all
-the more. Holm's correction is over all numbers.
+Half of a 95 % interval is 1.96 standard errors. The standard error of the difference of two numbers
+is the root of the sum of squares if the explanations use different recordings. For the same
+recording the numbers are not independent and the difference is known more accurately, so the test
+is conservative. Holm's correction is over all numbers.
 """
 
 from __future__ import annotations
@@ -32,15 +31,22 @@ from sims.user_toml import read_toml
 
 VERDICT, EXTENDED = "verdict.json", "extended.toml"
 _STRONGEST = 5
-"""Candidates of either that are compared."""
+"""Number of the best candidates of each explanation that are compared."""
 _HELD_OUT = ("rmse_base", "rmse_extended", "noise_floor", "gap_closed", "low", "high")
 _SIGMAS = 1.96
-"""Half the width of a 95 % interval, in standard errors."""
+"""Half width of a 95 % interval, in standard errors."""
 
 
 @dataclass(frozen=True)
 class Side:
-    """One of two explanations."""
+    """One of two explanations.
+
+    Attributes:
+        folder: its folder.
+        verdict: its verdict.
+        title: title of its extended simulator.
+        environment: versions, settings and machine with which it was made.
+    """
 
     folder: Path
     verdict: Verdict
@@ -49,7 +55,7 @@ class Side:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What was asked, of what, and by which versions on what machine."""
+        """System, settings, recordings, versions and machine of the explanation."""
         made = self.environment
         recordings = {each["file"]: each["sha256"] for each in made.get("recordings", [])}
         asked = {"system": self.verdict.system, "engine": self.verdict.engine}
@@ -61,7 +67,7 @@ class Side:
         }
 
     def place(self, effect: str) -> str:
-        """Whether an effect is a cause, an alternative to one, or neither."""
+        """Return whether an effect is a cause, an alternative to one, or neither."""
         if any(cause.effect == effect for cause in self.verdict.causes):
             return "cause"
         if any(effect in cause.alternatives for cause in self.verdict.causes):
@@ -70,10 +76,10 @@ class Side:
 
 
 def opened(folder: Path) -> Side:
-    """One of two explanations.
+    """Load one of two explanations.
 
     Raises:
-        InputError: it is none, or damaged.
+        InputError: the folder has no explanation, or it is damaged.
     """
     path = folder / VERDICT
     try:
@@ -92,14 +98,19 @@ def opened(folder: Path) -> Side:
 
 @dataclass(frozen=True)
 class Explained:
-    """What differs between two explanations."""
+    """Differences between two explanations.
+
+    Attributes:
+        a: first explanation.
+        b: second explanation.
+    """
 
     a: Side
     b: Side
 
     @cached_property
     def causes(self) -> list[dict[str, Any]]:
-        """Every effect that either names, with its place in both."""
+        """All effects that either explanation names, with their roles in both."""
         named = [
             effect
             for each in (self.a, self.b)
@@ -113,7 +124,7 @@ class Explained:
 
     @cached_property
     def numbers(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        """Coefficients and parameters that both have, or one alone, with their intervals."""
+        """Coefficients and parameters of either explanation, with intervals and significance."""
         coefficients = _beside(_coefficients(self.a), _coefficients(self.b))
         parameters = _beside(self.a.verdict.parameters, self.b.verdict.parameters)
         rows = [*coefficients, *parameters]
@@ -127,7 +138,7 @@ class Explained:
 
     @property
     def changed(self) -> bool:
-        """Whether verdict or causes differ, or a number does significantly."""
+        """Whether verdict or causes differ, or a number differs significantly."""
         other = self.a.verdict.verdict != self.b.verdict.verdict
         moved = any(row["significant"] for rows in self.numbers for row in rows)
         causes = any("cause" in pair and len(set(pair)) > 1 for pair in self._places())
@@ -138,7 +149,7 @@ class Explained:
 
     @property
     def worse(self) -> bool:
-        """Nobody can say of two explanations which is the worse.
+        """Unavailable: of two explanations, neither is worse.
 
         Raises:
             InputError: always.
@@ -153,7 +164,7 @@ class Explained:
         ]
 
     def _candidates(self) -> list[dict[str, Any]]:
-        """The strongest of either, with score and rank in both."""
+        """Return the best candidates of either explanation, with score and rank in both."""
         ranked = [
             {c.effect: (rank, c.score) for rank, c in enumerate(each.verdict.candidates, 1)}
             for each in (self.a, self.b)
@@ -168,7 +179,7 @@ class Explained:
 
     @cached_property
     def notes(self) -> list[str]:
-        """What to know before believing it."""
+        """Notes on limitations of the comparison."""
         notes = []
         if not (self.a.environment and self.b.environment):
             notes.append("of an older explanation settings and versions are not known")
@@ -180,7 +191,7 @@ class Explained:
         return notes
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Convert to a JSON document."""
         coefficients, parameters = self.numbers
         sides = [side(each.folder, each.title, each.environment) for each in (self.a, self.b)]
         return {
@@ -199,7 +210,7 @@ class Explained:
         }
 
     def lines(self) -> Iterator[str]:
-        """A short account."""
+        """Format the differences as text lines."""
         document = self.document()
         words = document["verdict"]
         same = words["a"] == words["b"]
@@ -228,7 +239,7 @@ class Explained:
         yield "something has changed" if self.changed else "nothing has changed significantly"
 
     def table(self) -> pd.DataFrame:
-        """For a CSV file."""
+        """Return the table for a CSV file."""
         coefficients, parameters = self.numbers
         held_out = [{**row, "name": f"heldout {row['name']}"} for row in self._held_out()]
         return pd.DataFrame([*coefficients, *parameters, *held_out])
@@ -260,7 +271,7 @@ def _beside(a: Mapping[str, Number], b: Mapping[str, Number]) -> list[dict[str, 
 
 
 def _p_value(row: Mapping[str, Any]) -> float:
-    """Of the difference being none; NaN where an interval is open or a number missing."""
+    """Compute the p-value of no difference; NaN if an interval is open or a number is missing."""
     ends = [row[key] for key in ("low_a", "high_a", "low_b", "high_b", "a", "b")]
     if any(end is None for end in ends):
         return math.nan

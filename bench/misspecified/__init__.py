@@ -1,3 +1,5 @@
-"""What an effect that the simulator lacks does to tuners: every tuner in the simulator as it is,
-and in the one that explain extended from a recording of the same world.
+"""Study of model misspecification: tuners in a simulator with a missing effect.
+
+Every tuner is compared in the original simulator, and in the one that explain extended from a
+recording of the same true system.
 """

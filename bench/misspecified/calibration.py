@@ -1,7 +1,7 @@
-"""The recording of the targets' world that explain gets, and the experiments before and after it.
+"""Calibration recording for explain, and the experiments before and after the extension.
 
-Nothing of the targets goes into the recording: its parameters, initial states, inputs and noise are
-drawn from streams of their own.
+The recording contains nothing of the targets: its parameters, initial states, inputs and noise are
+drawn from separate random streams.
 """
 
 from __future__ import annotations
@@ -29,12 +29,21 @@ from sims.recording.write import write_recording
 from sims.simulated import Simulated
 
 PLAIN, EXTENDED = "plain", "extended"
-"""The simulators in which tuners are compared: as it is, and as explain extended it."""
+"""Names of the simulators in which tuners are compared: the original and the extended one."""
 MODELS = (PLAIN, EXTENDED)
 
 
 def record(experiment: Experiment, salt: str, path: Path) -> Array:
-    """Write the recording; returns the parameters (p,) of the world that made it."""
+    """Write the calibration recording.
+
+    Args:
+        experiment: the experiment.
+        salt: salt from which the recording is drawn.
+        path: CSV file of the recording.
+
+    Returns:
+        True parameters, (p,).
+    """
     problem = Problem(experiment, salt)
     wanted = experiment.calibration or Calibration()
     streams = Streams(salt, experiment.name, "calibration", 0)
@@ -80,8 +89,14 @@ def _run(problem: Problem, number: int, scene: Scenario, seen: Array, held_out: 
 
 
 def explained(recording: Path, experiment: Experiment, jobs: int) -> Extended:
-    """Have explain extend the simulator from the recording, and write its answer beside it."""
-    from bench.gap.explain import explain  # it brings all of explain along
+    """Extend the simulator by explain, and write its result to the subfolder `explain`.
+
+    Args:
+        recording: CSV file of the calibration recording.
+        experiment: the experiment.
+        jobs: number of worker processes.
+    """
+    from bench.gap.explain import explain  # a local import, because it imports all of explain
     from bench.gap.model.watch import Watch
 
     found = explain([recording], free=experiment.free, watch=Watch(), jobs=max(jobs, 1))
@@ -90,19 +105,23 @@ def explained(recording: Path, experiment: Experiment, jobs: int) -> Extended:
 
 
 def extension(file: Path) -> Extended:
-    """The extended simulator in a file that explain wrote.
+    """Load an extended simulator from a file that explain wrote.
 
     Raises:
-        InputError: it cannot be used.
+        InputError: the file cannot be used.
     """
     return extending.opened(file, simulators.get)[0]
 
 
 def coefficients(extended: Extended, kind: type[Simulator]) -> dict[str, list[float]]:
-    """The coefficients of an extended simulator by effect, in the effect's order.
+    """List the coefficients of an extended simulator by effect, in the order of the effect.
+
+    Args:
+        extended: the extended simulator.
+        kind: class of the simulator.
 
     Raises:
-        InputError: the simulator is of a kind that takes no effects.
+        InputError: the simulator does not support effects.
     """
     if not issubclass(kind, Simulated):
         raise InputError(f"simulator {kind.name} takes no effects, and cannot be extended")
@@ -114,16 +133,22 @@ def coefficients(extended: Extended, kind: type[Simulator]) -> dict[str, list[fl
 
 
 def before(experiment: Experiment) -> Experiment:
-    """The comparison in the simulator as it is."""
+    """Make the experiment in the original simulator."""
     return _part(experiment, PLAIN, experiment.settings)
 
 
 def after(experiment: Experiment, effects: dict[str, list[float]]) -> Experiment:
-    """The comparison in the extended simulator: what is tuned stays, and the effects that it lacked
-    act as explain fitted them.
+    """Make the experiment in the extended simulator.
+
+    The tuned parameters remain the same. The missing effects act with the coefficients that explain
+    fitted.
+
+    Args:
+        experiment: the experiment.
+        effects: coefficients by name of the effect.
     """
     settings = dict(experiment.settings)
-    # What is tuned already goes on being tuned: explain fitted its own value of that too.
+    # An effect that is tuned stays tuned, although explain fitted its coefficients too.
     tuned = {*settings.get("effects", ()), *(p for p in experiment.parameters)}
     added = {name: values for name, values in effects.items() if name not in tuned}
     settings["fixed"] = {**settings.get("fixed", {}), **added}

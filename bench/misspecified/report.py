@@ -1,4 +1,4 @@
-"""Tables and figures of a study of a missing effect, and of several together."""
+"""Tables and figures of a misspecification study, and of several studies together."""
 
 from __future__ import annotations
 
@@ -22,18 +22,26 @@ from sims.files import write
 
 Say = Callable[[str], None]
 VERDICT = "explain/verdict.json"
-"""What explain said, in a study's folder."""
+"""Path of the verdict of explain, in the folder of a study."""
 
 
 class Studied(Protocol):
-    """What is reported: a study in its folder."""
+    """Protocol of the studies that can be reported."""
 
     folder: Path
     configuration: Configuration
 
 
 def finish(study: Studied, say: Say) -> int:
-    """Write and say what a study came to; how many runs failed."""
+    """Write tables and figures of a study, and print a summary.
+
+    Args:
+        study: the study.
+        say: prints a line.
+
+    Returns:
+        Number of failed runs.
+    """
     folder, experiment = study.folder, study.configuration.experiment
     failed = _comparisons(folder, say)
     one = scores.outcome(folder, experiment) if has_both(folder) else None
@@ -45,7 +53,13 @@ def finish(study: Studied, say: Say) -> int:
 
 
 def conclude(folder: Path, parts: Sequence[Path], say: Say) -> None:
-    """Write and say what several studies come to together, in the folder that holds them."""
+    """Write tables and figures of several studies together, and print a summary.
+
+    Args:
+        folder: folder that contains the studies.
+        parts: folders of the studies.
+        say: prints a line.
+    """
     there = [part for part in parts if has_both(part)]
     outcomes = [scores.outcome(part, configuration(part).experiment) for part in there]
     outcomes = [one for one in outcomes if one.targets()]
@@ -56,13 +70,15 @@ def conclude(folder: Path, parts: Sequence[Path], say: Say) -> None:
 
 
 def has_both(folder: Path) -> bool:
-    """Whether there are runs of both comparisons of a study."""
+    """Return whether a study has runs of both comparisons."""
     return all((folder / model / "runs.parquet").is_file() for model in MODELS)
 
 
 def _comparisons(folder: Path, say: Say) -> int:
-    """Write the tables of the comparisons that there are, as every comparison has them; how many
-    runs failed.
+    """Write the tables of the comparisons that exist.
+
+    Returns:
+        Number of failed runs.
     """
     failed = 0
     for model in MODELS:
@@ -79,7 +95,7 @@ def _comparisons(folder: Path, say: Say) -> int:
 
 
 def _written(folder: Path, outcomes: Sequence[scores.Outcome], say: Say, whole: bool) -> None:
-    """Write tables and figures of one study, or of all together, and say the short of it."""
+    """Write tables and figures of one study, or of all together, and print a summary."""
     experiment: Experiment = outcomes[0].experiment
     frames = {
         "table": pd.concat([scores.table(one) for one in outcomes]),
@@ -119,7 +135,7 @@ def _said(
 
 
 def _explained(one: scores.Outcome, folder: Path) -> str:
-    """What the world had and explain found."""
+    """Format the effects of the true system and the causes that explain named."""
     hidden = one.experiment.world.get("fixed", {})
     world = ", ".join(f"{name} {value}" for name, value in hidden.items()) or "nothing more"
     path = folder / VERDICT
@@ -129,7 +145,7 @@ def _explained(one: scores.Outcome, folder: Path) -> str:
 
 
 def _table(one: scores.Outcome, lines: pd.DataFrame) -> str:
-    """Errors of parameters and of prediction by tuner, before and after."""
+    """Format the errors of parameters and of prediction by tuner, in both simulators."""
     mine = lines[(lines["experiment"] == one.experiment.name) & lines["metric"].isin(scores.RANKED)]
     heads = {scores.PARAMETERS: "parameters", scores.PREDICTION: f"unseen {one.channel}"}
     mine = mine.assign(column=mine["metric"].map(heads) + " " + mine["model"])
@@ -150,7 +166,7 @@ def _tau(row: pd.Series) -> str:
 
 
 def _together(ranked: pd.DataFrame, metric: str) -> str:
-    """Mean ranks over systems."""
+    """Format the mean ranks over several systems."""
     joint = scores.joint(ranked, metric)
     means = pd.DataFrame({model: joint.ranked[model].mean() for model in MODELS})
     means = means.sort_values(EXTENDED).rename_axis(index=None)

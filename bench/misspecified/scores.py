@@ -1,9 +1,9 @@
-"""What came of a study: signed and absolute errors of parameters, prediction of unseen runs, and
-how the tuners rank, in the simulator as it is and in the extended one.
+"""Scores of a misspecification study, in the original and in the extended simulator.
 
-A target's value is the mean over its seeds; means and intervals are over targets (95 % percentile
-bootstrap). Errors of parameters are in training widths. A run that failed has no error of its
-parameters here, counts among the failures, and ranks last on its target.
+They are signed and absolute errors of parameters, prediction errors of unseen runs, and ranks of
+the tuners. The value of a target is the mean over its seeds. Means and intervals are over targets
+(95 % percentile bootstrap). Errors of parameters are in training widths. A failed run has no
+parameter errors here; it is counted as a failure and ranks last on its target.
 """
 
 from __future__ import annotations
@@ -26,10 +26,13 @@ from bench.store.folder import read
 from sims.base import Array, Parameter
 
 BIAS, ABSOLUTE, PARAMETERS, PREDICTION = "bias", "absolute_error", "param_error", "heldout_error"
-"""Of one parameter: mean signed and mean absolute error; of all: their mean absolute error; of
-unseen runs: RMSE in the error channel."""
+"""Metrics of a misspecification study.
+
+They are the mean signed and the mean absolute error of one parameter, the mean absolute error of
+all parameters, and the RMSE of unseen runs in the error channel.
+"""
 RANKED = (PARAMETERS, PREDICTION)
-"""By which tuners are ranked."""
+"""Metrics by which tuners are ranked."""
 COLUMNS = [
     "experiment",
     "model",
@@ -63,15 +66,16 @@ WIDTHS = "training widths"
 
 @dataclass(frozen=True)
 class Outcome:
-    """The last recommendations of all runs of a study.
+    """Final recommendations of all runs of a study.
 
     Attributes:
-        experiment: that was studied.
-        unit: of the error channel.
-        channel: its name.
-        parameters: tuned.
-        errors: a row a model, tuner and target: for each parameter the signed error in training
-            widths, named as it is; `PARAMETERS` and `PREDICTION`; runs and failures.
+        experiment: the experiment.
+        unit: unit of the error channel.
+        channel: name of the error channel.
+        parameters: tuned parameters.
+        errors: one row per model, tuner and target. Columns are the signed error of each parameter
+            in training widths, under the name of the parameter; `PARAMETERS` and `PREDICTION`;
+            numbers of runs and failures.
     """
 
     experiment: Experiment
@@ -82,33 +86,47 @@ class Outcome:
 
     @property
     def name(self) -> str:
-        """Of the system, for tables and figures."""
+        """Name of the system, for tables and figures."""
         return self.experiment.name.removeprefix("misspecified-")
 
     def tuners(self) -> list[str]:
-        """Labels in the order of the experiment, of those that ran in both simulators."""
+        """List the labels of the tuners with results in both simulators, as in the experiment."""
         ran = set(self.errors["tuner"])
         return [e.label for e in self.experiment.tuners if e.label in ran]
 
     def matrix(
         self, model: str, metric: str, tuners: Sequence[str], targets: Sequence[str]
     ) -> Array:
-        """(targets, tuners) of a metric in one of the simulators."""
+        """Return a metric in one of the simulators as a matrix.
+
+        Args:
+            model: one of `MODELS`.
+            metric: name of the metric.
+            tuners: labels of the tuners.
+            targets: names of the targets.
+
+        Returns:
+            Values, (targets, tuners).
+        """
         part = self.errors[self.errors["model"] == model]
         table = part.pivot(index="target", columns="tuner", values=metric)
         values: Array = table.reindex(index=list(targets), columns=list(tuners)).to_numpy()
         return values
 
     def targets(self) -> list[str]:
-        """Names of those that were met in both simulators by all tuners."""
+        """List the names of the targets with results of all tuners in both simulators."""
         return sorted({str(name) for name in self.errors["target"]})
 
 
 def outcome(folder: Path, experiment: Experiment) -> Outcome:
-    """What the runs in a study's folder delivered.
+    """Load the scores of a study.
+
+    Args:
+        folder: result folder of the study.
+        experiment: its experiment.
 
     Raises:
-        InputError: a comparison in it is missing, unfinished or damaged.
+        InputError: a comparison of the study is missing, unfinished or damaged.
     """
     problem = Problem(experiment)
     parameters, widths = problem.cube.parameters, problem.cube.training_widths()
@@ -120,11 +138,12 @@ def outcome(folder: Path, experiment: Experiment) -> Outcome:
 
 
 def _whole(errors: pd.DataFrame) -> pd.DataFrame:
-    """The rows of targets that every tuner met in both simulators with all of its seeds: of a study
-    that was interrupted the others would compare different targets.
+    """Select the targets that every tuner finished in both simulators with all of its seeds.
+
+    In an interrupted study, other targets would compare different sets of targets.
     """
     asked = errors.groupby(["model", "tuner"])["runs"].transform("max")
-    # A tuner that could not be used in one simulator is compared in neither.
+    # A tuner that was skipped in one simulator is excluded from both.
     used = set.intersection(*(set(part["tuner"]) for _, part in errors.groupby("model")))
     there = errors[(errors["runs"] == asked) & errors["tuner"].isin(used)]
     met = there.groupby("target").size()
@@ -133,7 +152,7 @@ def _whole(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Array) -> pd.DataFrame:
-    """Rows of `Outcome.errors` of one of the comparisons."""
+    """Build the rows of `Outcome.errors` for one of the comparisons."""
     stored = read(folder)
     rows = Rows(stored.runs, stored.statuses, stored.experiment.budget)
     frame = rows.keys[["tuner", "target"]].copy()
@@ -143,21 +162,21 @@ def _last(folder: Path, model: str, parameters: Sequence[Parameter], widths: Arr
         frame[parameter.name] = np.where(rows.failed, np.nan, (recommended - true) / width)
     names = [parameter.name for parameter in parameters]
     frame[PARAMETERS] = frame[names].abs().mean(axis=1, skipna=False)
-    for name in names:  # of the absolute value the mean over seeds is taken apart
+    for name in names:  # the mean over seeds of the absolute value is computed separately
         frame[f"|{name}|"] = frame[name].abs()
     frame[PREDICTION] = np.where(rows.failed, np.nan, rows.curves(PREDICTION).values[:, -1])
     frame["runs"], frame["failures"] = 1, rows.failed.astype(int)
     sums = {"runs": "sum", "failures": "sum"}
     means = {c: "mean" for c in frame.columns if c not in ("tuner", "target", *sums)}
     grouped = frame.groupby(["tuner", "target"], sort=False, as_index=False).agg({**means, **sums})
-    # A target on which a seed failed counts as failed: its other seeds are the easier ones.
+    # A target with a failed seed counts as failed, because its other seeds are the easier ones.
     grouped.loc[grouped["failures"] > 0, list(means)] = np.nan
     grouped.insert(0, "model", model)
     return grouped
 
 
 def table(one: Outcome) -> pd.DataFrame:
-    """Means with intervals, columns as `COLUMNS`."""
+    """Build the table of means with intervals; columns as in `COLUMNS`."""
     lines = []
     for (model, tuner), part in one.errors.groupby(["model", "tuner"], sort=False):
         wanted = [
@@ -179,7 +198,7 @@ def table(one: Outcome) -> pd.DataFrame:
 
 
 def ranks(one: Outcome) -> pd.DataFrame:
-    """Mean rank over targets of each tuner in both simulators, columns as `RANK_COLUMNS`."""
+    """Build the table of each tuner's mean rank in both simulators; columns as `RANK_COLUMNS`."""
     tuners, targets = one.tuners(), one.targets()
     lines = []
     for metric in RANKED:
@@ -189,7 +208,7 @@ def ranks(one: Outcome) -> pd.DataFrame:
 
 
 def ranking(one: Outcome) -> pd.DataFrame:
-    """Whether the tuners rank alike in both simulators, columns as `RANKING_COLUMNS`."""
+    """Build the table of rank agreement between simulators; columns as `RANKING_COLUMNS`."""
     tuners, targets = one.tuners(), one.targets()
     lines = []
     for metric in RANKED:
@@ -202,7 +221,7 @@ def ranking(one: Outcome) -> pd.DataFrame:
 
 
 def _friedman(errors: Array) -> float:
-    """Friedman's p-value over targets, that all tuners are alike; NaN of too few."""
+    """Compute the p-value of Friedman's test over targets; NaN if there are too few."""
     from scipy.stats import friedmanchisquare
 
     targets, tuners = errors.shape
@@ -214,13 +233,15 @@ def _friedman(errors: Array) -> float:
 
 @dataclass(frozen=True)
 class Joint:
-    """The mean ranks of tuners over several systems, by one metric.
+    """Mean ranks of tuners over several systems, by one metric.
 
     Attributes:
-        ranked: by model, a row a system, a column a tuner: ranks of the mean ranks, 1 best.
-        tau: between the two simulators' mean ranks over systems.
-        friedman: p-value by model; NaN for too few systems.
-        apart: pairs of tuners that Nemenyi's test tells apart (p < 0.05) by model.
+        ranked: table by model with one row per system and one column per tuner: ranks of the mean
+            ranks, 1 is best.
+        tau: Kendall's tau between the mean ranks over systems in both simulators.
+        friedman: p-value of Friedman's test by model; NaN if there are too few systems.
+        apart: number of pairs of tuners by model that differ significantly by Nemenyi's test (p <
+            0.05).
     """
 
     ranked: Mapping[str, pd.DataFrame]
@@ -230,7 +251,12 @@ class Joint:
 
 
 def joint(ranked: pd.DataFrame, metric: str) -> Joint:
-    """Ranks over systems, of rows as `ranks` gives them for several."""
+    """Compute the ranks over systems.
+
+    Args:
+        ranked: rows of `ranks` of several systems.
+        metric: name of the metric.
+    """
     part = ranked[ranked["metric"] == metric]
     tables, friedman, apart = {}, {}, {}
     for model in MODELS:

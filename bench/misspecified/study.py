@@ -1,8 +1,9 @@
-"""A study of a missing effect in its folder: a recording of the world is made, explain extends the
-simulator from it, and every tuner is compared in both simulators on the same targets.
+"""Misspecification study in its result folder.
 
-The folder holds `calibration.csv`, explain's answer in `explain/`, and two comparisons, `plain/`
-and `extended/`, each a folder as any comparison's.
+A recording of the true system is made, explain extends the simulator from it, and every tuner is
+compared in both simulators on the same targets. The folder contains `calibration.csv`, the result
+of explain in `explain/`, and two comparisons, `plain/` and `extended/`, each in the common format
+of comparisons.
 """
 
 from __future__ import annotations
@@ -35,25 +36,26 @@ if TYPE_CHECKING:
 
 Say = Callable[[str], None]
 RECORDING = "calibration.csv"
-"""What explain gets."""
+"""Calibration recording from which explain extends the simulator."""
 ANSWER = "explain/extended.toml"
-"""The simulator that it gives."""
+"""Extended simulator that explain writes."""
 
 
 class MisspecifiedStudy:
-    """Tuners in a simulator that lacks an effect, and in the one that explain extended; fulfils
-    `bench.study.Study`.
+    """Study of tuners in a simulator with a missing effect and in the extended one.
+
+    It implements `bench.study.Study`.
 
     Args:
-        folder: of such a study.
+        folder: result folder of such a study.
 
     Attributes:
-        folder: where everything lies.
-        configuration: what it is for.
+        folder: result folder.
+        configuration: stored configuration of the study.
         plugins: plugin files that it needs.
 
     Raises:
-        InputError: it is no such folder, or it is damaged.
+        InputError: the folder does not contain such a study, or it is damaged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -70,13 +72,21 @@ class MisspecifiedStudy:
         jobs: int = 2,
         salt: str | None = None,
     ) -> MisspecifiedStudy:
-        """A study in a new folder; nothing has been recorded yet; see `bench.study.Study.begin`."""
+        """Create a study in a new folder, without running it; see `bench.study.Study.begin`.
+
+        Args:
+            experiment: experiment with a calibration table.
+            plugins: plugin files that it needs.
+            folder: new result folder; None for the default one.
+            jobs: number of worker processes that will be used; 0 runs everything in this process.
+            salt: random string from which targets are drawn; see `bench.study.Study.begin`.
+        """
         from bench.runs.begun import begun
         from bench.runs.identity import fingerprint
         from bench.runs.runner import prepare, refuse_unreachable
 
         new = begun(experiment, folder, jobs, salt)
-        # Before there is a folder: a fault of the user's leaves nothing behind.
+        # Validated before the folder is created: an error of the user leaves no files.
         prepare(before(new.experiment), new.secret)
         if jobs:
             refuse_unreachable(new.experiment)
@@ -84,7 +94,12 @@ class MisspecifiedStudy:
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> MisspecifiedStudy:
-        """A study that was interrupted: what is finished stays; see `bench.study.Study.resume`."""
+        """Open an interrupted study to run what is missing; see `bench.study.Study.resume`.
+
+        Args:
+            folder: result folder.
+            plugins: further plugin files.
+        """
         from bench.runs.identity import unchanged
 
         study = cls(folder)
@@ -94,7 +109,13 @@ class MisspecifiedStudy:
     def make(
         self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
     ) -> Made:
-        """Make what is missing; see `bench.study.Study.make`."""
+        """Run what is missing; see `bench.study.Study.make`.
+
+        Args:
+            jobs: number of worker processes.
+            progress: makes progress callbacks; None for no progress output.
+            pool: worker pool; None to create one.
+        """
         from bench.runs.runner import silent
 
         finished = planned = 0
@@ -108,7 +129,7 @@ class MisspecifiedStudy:
             made = comparison.make(jobs, progress, pool)
             finished, planned = finished + made.finished, planned + made.planned
             if not made.complete:
-                # The one that was not begun plans as much.
+                # The comparison that has not started has the same number of runs.
                 left = made.planned if model == PLAIN else 0
                 return Made(finished, planned + left, made.interrupted, made.stopped, made.skipped)
         reveal(self.folder, kept(self.folder, self.configuration.experiment))
@@ -119,7 +140,7 @@ class MisspecifiedStudy:
         return Made(finished, planned)
 
     def _planned(self) -> int:
-        """Runs in each simulator."""
+        """Return the number of runs in each simulator."""
         from bench.runs.runner import seeds_of
 
         experiment = self.configuration.experiment
@@ -127,13 +148,13 @@ class MisspecifiedStudy:
         return runs * experiment.targets * len(experiment.ranges)
 
     def _extend(self, jobs: int, progress: Progress) -> None:
-        """Record the world and have explain extend the simulator, where that is still to do."""
+        """Record the true system and extend the simulator by explain, unless done already."""
         if (self.folder / ANSWER).is_file():
             return
         experiment = self.configuration.experiment
         step = progress("explaining", 1)
         table = self.folder / RECORDING
-        # One of the two without the other is what a kill left.
+        # If only one of the two files exists, the process was killed while writing.
         for file in (table, table.with_suffix(".toml")):
             file.unlink(missing_ok=True)
         record(experiment, self._salt(), table)
@@ -145,24 +166,26 @@ class MisspecifiedStudy:
         return kept(self.folder, experiment) or experiment.salt
 
     def _comparison(self, model: str, jobs: int) -> Comparison:
-        """The comparison in one of the simulators, begun or taken up."""
+        """Create or resume the comparison in one of the simulators."""
         place, experiment = self.folder / model, self.configuration.experiment
         if (place / CONFIGURATION).is_file():
             comparison = Comparison.resume(place, self.plugins)
         else:
-            # A public salt stands in the experiment already.
+            # A public salt is already part of the experiment.
             secret = kept(self.folder, experiment)
             plan = replace(self.experiment_of(model), salt_sha256="")
             comparison = Comparison.begin(plan, self.plugins, place, jobs, secret)
         if comparison.results is not None:
-            # What is known of the truths lies in the other simulator's folder too.
+            # The folder of the other simulator contains the same truths, so it must be inaccessible
+            # too.
             everything = (str(self.folder.resolve()), *comparison.results.hidden)
             comparison.results.hidden = everything
         return comparison
 
     def experiment_of(self, model: str) -> Experiment:
-        """The comparison that is made in one of the simulators; in the extended one only once that
-        is there.
+        """Return the experiment of the comparison in one of the simulators.
+
+        The extended simulator must exist for its experiment.
         """
         from bench.problem.robots import kind_of
 
@@ -174,13 +197,13 @@ class MisspecifiedStudy:
         return after(experiment, coefficients(found, kind))
 
     def close(self) -> None:
-        """Let go of the folder; its comparisons are opened when they are made."""
+        """Close the study; its comparisons are opened when they run."""
 
     def status(self) -> Standing:
-        """Which runs the folder holds and which are missing, in both simulators.
+        """Return which runs are stored and which are missing, in both simulators.
 
         Raises:
-            InputError: it is damaged.
+            InputError: the study is damaged.
         """
         held = self.configuration
         ends: list[End] = []
@@ -199,13 +222,16 @@ class MisspecifiedStudy:
         return Standing(name, "runs finished", held.fingerprint, tuple(ends), under_way)
 
     def finish(self, say: Say) -> int:
-        """Write tables and figures of what there is, and say what came out.
+        """Write tables and figures, and print a summary.
+
+        Args:
+            say: prints a line.
 
         Returns:
-            How many runs failed.
+            Number of failed runs.
 
         Raises:
-            InputError: a comparison in it is damaged.
+            InputError: a comparison of the study is damaged.
         """
         from bench.misspecified.report import finish
 

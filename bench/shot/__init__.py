@@ -1,7 +1,7 @@
-"""The bounce shot: tune a simulator to one recorded drop, plan a shot in it, make the shot in
-another world.
+"""Bounce shot: tune a simulator to one recorded drop, plan a shot in it, execute it elsewhere.
 
-`settings` reads the experiment's [shot] table, `deal` draws balls, scenes and release errors and
-records the drops, `tune` turns a recording into models and plans without knowing the ball, `throw`
-makes the shots, `study` runs it all, `table` and `pictures` tell what came out.
+The shot is executed in another simulator, the true world. `settings` reads the experiment's [shot]
+table, `deal` draws balls, scenes and release errors and records the drops, `tune` converts a
+recording to models and plans without knowing the ball, `throw` executes the shots, `study` runs all
+steps, `table` and `pictures` report the results.
 """

@@ -1,6 +1,4 @@
-"""A shot as a short animation: the filmed drop as it was tracked, then every method's plan and what
-the ball did.
-"""
+"""Animation of a shot: the filmed and tracked drop, then the planned and executed shots."""
 
 from __future__ import annotations
 
@@ -22,17 +20,20 @@ from sims.camera.video import Video
 from sims.recording.recording import read_recording
 
 _FRAMES_PER_SECOND = 12
-"""Of the animation."""
+"""Frame rate of the animation, Hz."""
 _SLOWER = 2.0
-"""Shots are shown so many times slower than they are."""
+"""Slow-motion factor of the shots."""
 _HOLD = 9
-"""Frames for which the end is shown."""
+"""Number of frames for which the end is shown."""
 _DPI = 70
 
 
 class Film(NamedTuple):
-    """Pictures of a drop, as many a second as the animation has, and the middles (n, 2) tracked
-    until each, pixels.
+    """Film of a drop, resampled to the frame rate of the animation.
+
+    Attributes:
+        pictures: frames of the film.
+        tracks: for each frame, the ball centres tracked until then, pixels, (n, 2).
     """
 
     pictures: list[Image]
@@ -40,7 +41,7 @@ class Film(NamedTuple):
 
 
 class _Moving(NamedTuple):
-    """A flown path (T, 3) until sample `end`, its line, and the ball at the line's end."""
+    """Flown path (T, 3) until sample `end`, its line, and the ball at the end of the line."""
 
     path: Array
     end: int
@@ -54,7 +55,7 @@ class _Moving(NamedTuple):
 
 
 class _Filmed(NamedTuple):
-    """The panel of the film: the picture, the track so far, and a ring around its end."""
+    """Panel of the film: frame, track so far, and a ring around its end."""
 
     picture: Any
     track: Any
@@ -73,18 +74,24 @@ def animate(
     kept: Mapping[str, Any],
     trusted: bool = False,
 ) -> Path:
-    """Write figures/shot.gif: the drop at its own speed, where it was filmed, and the shots at half
-    of it.
+    """Write figures/shot.gif: a drop at normal speed, if it was filmed, and shots at half speed.
+
+    Args:
+        folder: result folder.
+        settings: the [shot] table.
+        example: the shot and its methods.
+        kept: stored results by name of the shot.
+        trusted: whether tuners ran without isolation, which the title then says.
 
     Returns:
-        The file.
+        Path of the animation.
     """
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     dealt, methods = example
     film = _film(folder / RECORDINGS / f"{dealt.name}.mp4")
     beside = int(bool(film.pictures))
-    # Margins are set once, below: an engine that sets them anew would make the panels shake.
+    # Margins are set once, below: a layout engine would move the panels from frame to frame.
     figure, axes = blank(
         1,
         len(methods) + beside,
@@ -119,7 +126,7 @@ def animate(
 
 
 def _shot_panel(axis: Any, dealt: Deal, method: str, shot: Shown) -> _Moving:
-    """One method's panel, before anything has moved."""
+    """Draw the panel of one method in the initial state."""
     shot_panel(axis, dealt, method, shot)
     line = axis.lines[-1]
     line.set_data([], [])
@@ -139,9 +146,7 @@ def _film_panel(axis: Any, film: Film) -> _Filmed:
 
 
 def _film(path: Path) -> Film:
-    """What there is of a film and its track; nothing where drops were not filmed, or the film is
-    gone.
-    """
+    """Read the film of a drop and its track; the result is empty if there is no film."""
     try:
         frames = list(Video(path))
         run = read_recording(path.with_suffix(".csv"), Ball, whole=True).runs[0]

@@ -1,7 +1,7 @@
-"""Draws what each shot is made with, the same for every method, and records the ball's drop.
+"""Draw ball, scene and release error of each shot, and record the ball's drop.
 
-The recorded drop is filmed and tracked, or heights of the centre at the sampling rate with noise.
-Either is a recording like any other.
+They are the same for every method. The drop is filmed and tracked, or recorded as heights of the
+centre with noise. Both are recordings in the common format.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from sims.shot.scene import ShotScene
 from sims.shot.world import GRAVITY, Ground, fly
 
 RECORDINGS = "recordings"
-"""The folder of recorded drops, in a study's."""
+"""Name of the folder of recorded drops, in the folder of a study."""
 
 
 @dataclass(frozen=True)
 class Deal:
-    """One ball and one shot.
+    """Ball, scene and release error of one shot.
 
     Attributes:
-        name: e.g. ``tennis-007``.
-        ball: the truth, which only the world knows.
-        scene: incline and hoop, which everybody knows.
-        release: error of the place of release, m: along x, and in height.
-        salt: what it was drawn from.
+        name: for example ``tennis-007``.
+        ball: true ball, which only the true world uses.
+        scene: incline and hoop, which all methods know.
+        release: error of the release position, m: along x, and in height.
+        salt: salt from which the shot was drawn.
     """
 
     name: str
@@ -48,8 +48,14 @@ class Deal:
 
 
 def deal(experiment: Experiment, settings: Settings, kind: str, index: int, salt: str = "") -> Deal:
-    """Shot `index` of a kind of ball; it depends on the experiment's name, not on methods or
-    numbers of shots.
+    """Draw a shot; the result does not depend on the methods or the number of shots.
+
+    Args:
+        experiment: the experiment; its name is part of the seed.
+        settings: the [shot] table.
+        kind: kind of ball.
+        index: index of the shot with this kind of ball.
+        salt: salt from which the shot is drawn.
     """
     rng = rng_for(*_of(salt), experiment.name, "shot", kind, index)
     # The order of the draws is part of the experiment: another order gives other shots.
@@ -58,20 +64,26 @@ def deal(experiment: Experiment, settings: Settings, kind: str, index: int, salt
         float(rng.uniform(*pair)) for pair in (settings.angle, settings.hoop_x, settings.hoop_drop)
     )
     dx, dz = (settings.release * rng.standard_normal(2)).tolist()
-    # A ball that touches the incline at x = 0 has its centre radius / cos(angle) above it.
+    # The centre of a ball that touches the incline at x = 0 is radius / cos(angle) above it.
     touching = ball.radius / math.cos(angle)
     scene = ShotScene(angle, x, touching - drop, settings.hoop_radius)
     return Deal(f"{kind}-{index:03d}", ball, scene, (dx, dz), salt)
 
 
 def _of(salt: str) -> tuple[str, ...]:
-    """What the names of streams begin with; public ones with nothing."""
+    """Return the first words of the names of random streams; none for a public salt."""
     return () if salt in ("", PUBLIC) else ("salt", salt)
 
 
 def deals(experiment: Experiment, settings: Settings, salt: str = "") -> list[Deal]:
-    """All shots of an experiment; the balls take turns, so that a part of the work is a part of
-    each.
+    """Draw all shots of an experiment.
+
+    The kinds of balls alternate, so that an interrupted study has shots of each.
+
+    Args:
+        experiment: the experiment.
+        settings: the [shot] table.
+        salt: salt from which the shots are drawn.
     """
     return [
         deal(experiment, settings, kind, i, salt)
@@ -81,18 +93,28 @@ def deals(experiment: Experiment, settings: Settings, salt: str = "") -> list[De
 
 
 def in_view(path: Path, experiment: Experiment) -> float:
-    """The share of a drop's sample times at which its recording has a height."""
+    """Compute the fraction of a drop's sample times at which its recording has a height.
+
+    Args:
+        path: the recording.
+        experiment: the experiment, for the number of samples.
+    """
     z = read_recording(path, BallSimulator, whole=True).runs[0].channels["z"]
     return float(np.isfinite(z).sum() / experiment.sampling.samples)
 
 
 def record(experiment: Experiment, dealt: Deal, settings: Settings, path: Path) -> None:
-    """Record a drop of the ball on level ground; nothing is done where there is a recording
-    already.
+    """Record a drop of the ball on level ground, unless the recording exists already.
+
+    Args:
+        experiment: the experiment.
+        dealt: the shot.
+        settings: the [shot] table.
+        path: CSV file of the recording.
     """
     if path.exists() and path.with_suffix(".toml").exists():
         return
-    # One of the two without the other is what a kill left.
+    # If only one of the two files exists, the process was killed while writing.
     for left in (path, path.with_suffix(".toml")):
         left.unlink(missing_ok=True)
     rng = rng_for(*_of(dealt.salt), experiment.name, "drop", dealt.name)
@@ -106,7 +128,7 @@ def record(experiment: Experiment, dealt: Deal, settings: Settings, path: Path) 
         return
     noise = experiment.noise.get("z", 0.0)
     seen = z + noise * rng.standard_normal(z.shape)
-    # To a hundredth of a millimetre, far below any noise: the file stays short.
+    # Rounded to 0.01 mm, far below any noise, to keep the file short.
     run = Run("1", times, {"z": np.round(seen, 5)}, {}, {}, {}, False)
     known = {"radius": radius, "mass": dealt.ball.mass, "gravity": GRAVITY}
     recording = Recording(path, "ball", f"a drop of {dealt.name}", known, {"z": noise}, (run,))

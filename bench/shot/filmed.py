@@ -1,6 +1,4 @@
-"""A drop on film: what a camera that stands three metres away sees of it, and the recording that
-the tracker makes.
-"""
+"""Film a drop with a camera about three metres away, and track the ball in the film."""
 
 from __future__ import annotations
 
@@ -19,28 +17,27 @@ from sims.camera.render import Stage
 from sims.camera.video import write_video
 
 DISTANCE = (2.8, 3.4)
-"""Range of the camera's distance, m: the whole drop is in the picture."""
+"""Range of the camera's distance, m; the whole drop is in the picture."""
 HEIGHT = (0.8, 1.4)
-"""Range of its height, m."""
+"""Range of the camera's height, m."""
 AIM = 0.9
-"""Height at which it looks, m."""
+"""Height of the point at which the camera looks, m."""
 NARROW = 0.4
-"""Width of the picture over its height: what falls needs no more."""
+"""Aspect ratio of the picture, width over height; a falling ball needs no wide picture."""
 
 
 def filmed(
     path: Path, heights: Array, times: Array, radius: float, pixels: int, rng: np.random.Generator
 ) -> None:
-    """Film a drop and write what the tracker sees of it: `path` (.csv), its description, film and
-    camera beside it.
+    """Film a drop, and write the tracked recording with description, film and camera.
 
     Args:
-        path: of the recording.
-        heights: (T,) of the ball's centre, m.
-        times: (T,) seconds.
-        radius: of the ball, m.
+        path: CSV file of the recording.
+        heights: heights of the ball's centre, m, (T,).
+        times: times, seconds, (T,).
+        radius: radius of the ball, m.
         pixels: height of the picture, even.
-        rng: draws place, light, colours, noise and compression.
+        rng: random generator for camera position, light, colours, noise and compression.
 
     Raises:
         InputError: the packages for films are missing, or the ball cannot be found in the film.
@@ -48,11 +45,11 @@ def filmed(
     azimuth, distance, height = (
         float(rng.uniform(*pair)) for pair in ((0.0, 2.0 * math.pi), DISTANCE, HEIGHT)
     )
-    # The codec halves the resolution of colour, so both sides must be even.
+    # The codec halves the resolution of colour, so both dimensions must be even.
     size = (2 * round(NARROW * pixels / 2), pixels)
     camera, look = Camera(azimuth, distance, height, (0.0, 0.0, AIM), size=size), Look.drawn(rng)
     film = path.with_suffix(".mp4")
-    # Recordings and films are never overwritten, and a kill may have left some of them.
+    # Recordings and films are never overwritten, and a killed process may have left some of them.
     for left in (
         film,
         beside(film),

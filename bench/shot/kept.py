@@ -1,4 +1,4 @@
-"""What is kept of each shot: a file with every method's model and what became of its plan."""
+"""Stored result of each shot: a file with the tuned model and the outcome of every method."""
 
 from __future__ import annotations
 
@@ -19,33 +19,43 @@ from sims.base import InputError
 from sims.files import write
 
 SHOTS = "shots"
-"""The folder of finished shots, in a study's."""
+"""Name of the folder of finished shots, in the folder of a study."""
 _REMEDY = "damaged; delete it, and resume to make it again"
 _NUMBERS = ("height", "margin", "restitution", "seconds")
-"""Of a model; each may be none."""
+"""Numbers of a model that may be missing."""
 
 
 def path_of(folder: Path, dealt: Deal) -> Path:
-    """The file of a shot in a study's folder; it is there when the shot has been made."""
+    """Return the file of a shot; it exists once the shot has been executed.
+
+    Args:
+        folder: result folder of the study.
+        dealt: the shot.
+    """
     return folder / SHOTS / f"{dealt.name}.json"
 
 
 def missing(folder: Path, dealt: Sequence[Deal]) -> list[Deal]:
-    """The shots that have not been made."""
+    """List the shots that have not been executed.
+
+    Args:
+        folder: result folder of the study.
+        dealt: all shots.
+    """
     return [one for one in dealt if not path_of(folder, one).exists()]
 
 
 def keep(
     folder: Path, dealt: Deal, settings: Settings, models: list[dict[str, Any]], seen: float
 ) -> None:
-    """Make a shot with every method's model, and keep all of it, whole or not at all.
+    """Execute a shot with the model of every method, and store the result atomically.
 
     Args:
-        folder: the study's.
+        folder: result folder of the study.
         dealt: ball, scene and release error.
-        settings: of the study.
-        models: as `bench.shot.tune.models` gives them.
-        seen: the share of the drop's sample times at which its recording has a height.
+        settings: the [shot] table of the study.
+        models: models as returned by `bench.shot.tune.models`.
+        seen: fraction of the drop's sample times at which its recording has a height.
     """
     rows = [{**row, "seen": seen} for row in thrown(dealt, settings, models)]
     document = _plain({"models": models, "rows": rows})
@@ -53,7 +63,11 @@ def keep(
 
 
 def read(folder: Path, dealt: Deal) -> dict[str, Any] | None:
-    """What is kept of a shot; None where it has not been made.
+    """Read the stored result of a shot; return None if the shot has not been executed.
+
+    Args:
+        folder: result folder of the study.
+        dealt: the shot.
 
     Raises:
         InputError: the file is damaged.
@@ -75,13 +89,17 @@ def read(folder: Path, dealt: Deal) -> dict[str, Any] | None:
         says = f"expected a row of {wanted[0]} for each model, found others"
         raise InputError(f"{path}: {says}; {_REMEDY}")
     for model in kept["models"]:
-        # JSON has no NaN, and null is no number to plan with.
+        # JSON has no NaN, so missing numbers are stored as null.
         model.update({name: math.nan for name in _NUMBERS if model[name] is None})
     return kept
 
 
 def check(folder: Path, dealt: Sequence[Deal]) -> None:
-    """Check all that is kept of these shots.
+    """Validate the stored results of shots.
+
+    Args:
+        folder: result folder of the study.
+        dealt: the shots.
 
     Raises:
         InputError: a file is damaged.
@@ -91,12 +109,12 @@ def check(folder: Path, dealt: Sequence[Deal]) -> None:
 
 
 def _check(kept: dict[str, Any], name: str, columns: Columns) -> None:
-    """Check the models or the rows of a shot.
+    """Validate the models or the rows of a shot.
 
     Raises:
-        CellError: one is not what it is declared to be.
-        KeyError: there is none.
-        TypeError: they are no tables.
+        CellError: a value does not match its declaration.
+        KeyError: the part is missing.
+        TypeError: the part is not a list of tables.
     """
     tables = kept[name]
     try:
@@ -112,7 +130,7 @@ def _check(kept: dict[str, Any], name: str, columns: Columns) -> None:
 
 
 def _check_effects(row: int, effects: Any) -> None:
-    """Check the coefficients of a model's effects."""
+    """Validate the coefficients of a model's effects."""
     coefficient = Column("effects", float)
     for values in effects.values():
         try:
@@ -123,7 +141,7 @@ def _check_effects(row: int, effects: Any) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can hold: numbers that are none become null."""
+    """Convert a value for JSON: numbers that are not finite become null."""
     if isinstance(value, dict):
         return {key: _plain(v) for key, v in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""The page of a bounce shot: report.html."""
+"""HTML report of a bounce-shot study, report.html."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bench.problem.experiment import Experiment
 from bench.shot.table import ALL
 
 _NAMED = 4
-"""Methods that a sentence names."""
+"""Maximum number of methods that a sentence names."""
 
 
 def shot_page(
@@ -28,14 +28,14 @@ def shot_page(
     rows: pd.DataFrame,
     pictures: Mapping[str, Pictures],
 ) -> str:
-    """The page as HTML: who hits comes first.
+    """Render the HTML report; the hit rates come first.
 
     Args:
-        experiment: what was compared.
-        folder: where it lies.
-        lines: of `bench.shot.table.table`.
-        rows: a row a method and shot.
-        pictures: its figures by name, as they are printed.
+        experiment: the experiment.
+        folder: result folder.
+        lines: table of `bench.shot.table.table`.
+        rows: one row per method and shot.
+        pictures: printed figures by name.
     """
     name = experiment.title or experiment.name
     made = f"Made by {code('simgap')} from the shots in {code(safe(folder, 300))}."
@@ -60,7 +60,7 @@ def shot_page(
 
 
 def _conclusion(lines: pd.DataFrame) -> Iterator[str]:
-    """Who hits most, and whose intervals overlap with that."""
+    """Yield sentences on the method with the most hits, and on those with overlapping intervals."""
     over = lines[lines["ball"] == ALL].sort_values("rate", ascending=False, kind="stable")
     best = over.iloc[0]
     yield (
@@ -82,7 +82,7 @@ def _rate(line: pd.Series[Any]) -> str:
 
 
 def _success(page: Page, lines: pd.DataFrame, pictures: Mapping[str, Pictures]) -> str:
-    """The share of hits of each method by ball."""
+    """Render the chart of the hit rate of each method by ball."""
     balls = [ALL, *(ball for ball in dict.fromkeys(lines["ball"]) if ball != ALL)]
     place = {ball: i for i, ball in enumerate(balls)}
     page.table("success", lines.assign(place=lines["ball"].map(place)))

@@ -1,6 +1,4 @@
-"""The figures of a bounce shot: success by ball and method, how far shots were off, and shots as
-planned and flown.
-"""
+"""Figures of a bounce-shot study: hits by ball and method, misses, and example shots."""
 
 from __future__ import annotations
 
@@ -44,9 +42,9 @@ _WORDS = {
     "extended": "simulator extended by explain from the same drop",
 }
 _REACH = 6
-"""Radii of the hoop beyond which shots are not shown."""
+"""Range of the shown misses, in radii of the hoop."""
 _BELOW = 0.12
-"""Metres below the hoop to which paths are drawn."""
+"""Distance below the hoop down to which paths are drawn, m."""
 
 
 def draw(
@@ -57,7 +55,19 @@ def draw(
     rows: pd.DataFrame,
     lines: pd.DataFrame,
 ) -> dict[str, Pictures]:
-    """All figures by name, as they are printed."""
+    """Draw all figures.
+
+    Args:
+        experiment: the experiment.
+        settings: the [shot] table.
+        dealt: all shots.
+        kept: stored results by name of the shot.
+        rows: rows of shots.csv.
+        lines: table of `bench.shot.table.table`.
+
+    Returns:
+        Printed figures by name.
+    """
     figures = {"success": success_figure(experiment, lines), "off": off_figure(settings, rows)}
     chosen = examples(dealt, kept, rows)
     if chosen:
@@ -66,23 +76,23 @@ def draw(
 
 
 def group_of(method: str) -> str:
-    """Untuned, tuned or extended."""
+    """Return the group of a method: untuned, tuned or extended."""
     if method == NOMINAL:
         return "untuned"
     return "extended" if method == EXPLAINED or method.endswith(AFTER) else "tuned"
 
 
 def label_of(method: str) -> str:
-    """A method as figures name it."""
+    """Return the label of a method in figures."""
     return "explain's own fit" if method == EXPLAINED else method
 
 
 def success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
-    """Left the share of hits over all balls; right hits of shots and the interval, ball by ball.
+    """Draw the hit rate over all balls (left) and hits with intervals by ball (right).
 
     Args:
-        experiment: what was compared.
-        lines: of `bench.shot.table.table`.
+        experiment: the experiment.
+        lines: table of `bench.shot.table.table`.
     """
     methods = list(lines["method"].unique())
     size = (11.5, 1.6 + 0.42 * len(methods))
@@ -99,14 +109,14 @@ def success_figure(experiment: Experiment, lines: pd.DataFrame) -> Figure:
 
 
 def _rates(axis: Axes, lines: pd.DataFrame, methods: Sequence[str]) -> None:
-    """Share of hits of each method over all balls, with its interval."""
+    """Draw the hit rate of each method over all balls, with its interval."""
     over = lines[lines["ball"] == ALL].set_index("method")
     for place, method in enumerate(methods):
         colour, marker = _GROUPS[group_of(method)]
         rate, low, high = (100 * float(over[c][method]) for c in ("rate", "low", "high"))
         axis.plot([low, high], [place, place], color=colour, linewidth=2)
         axis.plot(rate, place, marker=marker, color=colour, markersize=7)
-        # Not rounded to none or all.
+        # A decimal prevents rounding to 0 % or 100 %.
         near = 0 < rate < 0.5 or 99.5 <= rate < 100
         axis.annotate(
             f"{rate:.{1 if near else 0}f}",
@@ -123,7 +133,7 @@ def _rates(axis: Axes, lines: pd.DataFrame, methods: Sequence[str]) -> None:
 
 
 def _by_ball(axis: Axes, lines: pd.DataFrame, methods: Sequence[str]) -> None:
-    """Hits of shots, a cell each method and ball, the lighter the more."""
+    """Draw the hits as cells by method and ball; lighter cells have more hits."""
     balls = [ball for ball in lines["ball"].unique() if ball != ALL]
     for line in lines[lines["ball"] != ALL].to_dict("records"):
         x, y, rate = balls.index(line["ball"]), methods.index(line["method"]), float(line["rate"])
@@ -158,7 +168,7 @@ def _cell(x: int, y: int, rate: float) -> Any:
 
 
 def _legend(figure: Figure, methods: Sequence[str]) -> None:
-    """Groups that there are, below."""
+    """Draw the legend of the groups that occur, below the figure."""
     from matplotlib.lines import Line2D
 
     present = {group_of(method) for method in methods}
@@ -173,12 +183,11 @@ def _legend(figure: Figure, methods: Sequence[str]) -> None:
 
 
 def off_figure(settings: Settings, rows: pd.DataFrame) -> Figure:
-    """Left where shots met the hoop's plane; right the distance between planned and flown path.
-    Boxes: quartiles.
+    """Draw where shots met the hoop's plane (left) and the prediction error (right) as box plots.
 
     Args:
-        settings: of the experiment.
-        rows: of shots.csv.
+        settings: the [shot] table.
+        rows: rows of shots.csv.
     """
     methods = list(rows["method"].unique())
     figure, axes = blank(1, 2, (11.5, 1.6 + 0.42 * len(methods)), sharey=True)
@@ -233,8 +242,17 @@ def _box(axis: Axes, values: Array, place: int, colour: str) -> None:
 def examples(
     dealt: Sequence[Deal], kept: Mapping[str, Any], rows: pd.DataFrame
 ) -> list[tuple[Deal, list[str]]]:
-    """A usual shot, if there is one that the untuned simulator missed, and the worst; and which
-    methods to show.
+    """Select example shots: a typical one and the worst one of a tuned method.
+
+    The typical one is a shot that the untuned simulator missed, if there is one.
+
+    Args:
+        dealt: all shots.
+        kept: stored results by name of the shot.
+        rows: rows of shots.csv.
+
+    Returns:
+        The shots, each with the methods to show.
     """
     by_name = {one.name: one for one in dealt}
     tuned = [m for m in rows["method"].unique() if group_of(m) == "tuned"]
@@ -242,7 +260,7 @@ def examples(
         return []
     first = next((m for m in ("tunenet-vision", "tunenet") if m in tuned), tuned[0])
     shown = [m for m in (NOMINAL, first, EXPLAINED) if (rows["method"] == m).any()]
-    # Only shots that all of them made can be shown side by side.
+    # Only shots with a result of all shown methods can be compared.
     wide = rows.pivot(index="shot", columns="method", values="off")[shown].abs().dropna()
     if wide.empty:
         return []
@@ -255,12 +273,12 @@ def examples(
 
 
 class Shown(NamedTuple):
-    """What is shown of one shot.
+    """Example shot.
 
     Attributes:
-        models: by method.
-        throws: by method.
-        top: height in metres up to which all of it is seen.
+        models: tuned models by method.
+        throws: executed shots by method.
+        top: upper limit of the height axis, m.
     """
 
     models: dict[str, TunedModel]
@@ -271,7 +289,14 @@ class Shown(NamedTuple):
 def thrown(
     settings: Settings, dealt: Deal, methods: Sequence[str], kept: Mapping[str, Any]
 ) -> Shown:
-    """One shot, thrown again by each of the methods."""
+    """Execute one shot again with each of some methods.
+
+    Args:
+        settings: the [shot] table.
+        dealt: the shot.
+        methods: names of the methods.
+        kept: stored results by name of the shot.
+    """
     models = {model["method"]: TunedModel(**model) for model in kept[dealt.name]["models"]}
     throws = {method: throw(dealt, settings, models[method]) for method in methods}
     top = max(float(np.nanmax(t.flown[:, 2])) for t in throws.values()) + 0.1
@@ -281,12 +306,12 @@ def thrown(
 def shots_figure(
     settings: Settings, chosen: Sequence[tuple[Deal, list[str]]], kept: Mapping[str, Any]
 ) -> Figure:
-    """Shots as planned and as flown.
+    """Draw example shots as planned and as flown.
 
     Args:
-        settings: of the experiment.
-        chosen: as `examples` gives them, a row each.
-        kept: what was kept of each shot.
+        settings: the [shot] table.
+        chosen: examples as returned by `examples`, one per row.
+        kept: stored results by name of the shot.
     """
     columns = max(len(methods) for _, methods in chosen)
     size = (4.1 * columns, 0.9 + 3.1 * len(chosen))
@@ -309,7 +334,14 @@ def shots_figure(
 
 
 def shot_panel(axis: Axes, dealt: Deal, method: str, shot: Shown) -> None:
-    """Incline, hoop, planned and flown path of one shot; the flown path is the last line."""
+    """Draw incline, hoop, planned and flown path of one shot; the flown path is the last line.
+
+    Args:
+        axis: axes to draw on.
+        dealt: the shot.
+        method: name of the method.
+        shot: the executed example.
+    """
     scene, flight = dealt.scene, shot.throws[method]
     slope = np.array([-0.25, min(0.55 * scene.hoop_x, 0.45)])
     axis.fill_between(slope, -slope * np.tan(scene.angle), -0.35, color=SLOPE, linewidth=0)
@@ -331,9 +363,17 @@ def shot_panel(axis: Axes, dealt: Deal, method: str, shot: Shown) -> None:
 
 
 def end_of(path: Array, scene: ShotScene) -> int:
-    """Index of the sample at which a path is a little below the hoop after its bounce."""
+    """Return the index of the sample at which a path is below the hoop after its bounce.
+
+    Args:
+        path: positions, (T, 3).
+        scene: incline and hoop.
+
+    Returns:
+        Index of the sample, or the number of samples.
+    """
     z = path[:, 2]
-    # Before the bounce the ball falls through the same heights.
+    # Before the bounce, the ball falls through the same heights.
     risen = np.concatenate([[False], np.logical_or.accumulate(z[1:] > z[:-1])])
     falling = np.concatenate([[0], np.diff(z)]) < 0
     below = np.flatnonzero(risen & (z < scene.hoop_z - _BELOW) & falling)

@@ -1,4 +1,4 @@
-"""Writes tables and figures of a bounce shot, and says what came out."""
+"""Write the tables, figures and HTML report of a bounce-shot study and print a summary."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bench.store.status import STATUS_COLUMNS
 from sims.files import write
 
 SIMULATOR = "bounce-shot"
-"""What status.csv says that a shot is planned in."""
+"""Name of the simulator in status.csv."""
 _NUMBERS = (
     "off",
     "margin",
@@ -34,42 +34,46 @@ _NUMBERS = (
     "restitution",
     "seconds",
 )
-"""Columns of the shots that may be empty."""
+"""Numeric columns of the shots that may be empty."""
 _FAILED = ("crashed", "timeout")
 """Failures of the method and not of its plan, which make the command fail."""
 
 
 class Shots(Protocol):
-    """What is reported: the shots of a study.
+    """Protocol of the studies that can be reported.
 
     Attributes:
-        folder: where they lie.
+        folder: result folder.
     """
 
     folder: Path
 
     @property
     def experiment(self) -> Experiment:
-        """What was asked for, with the tuners that can be used here."""
+        """The experiment, with the tuners that can be used here."""
 
     @property
     def settings(self) -> Settings:
-        """Of the scene."""
+        """The [shot] table."""
 
     @property
     def deals(self) -> list[Deal]:
-        """Every shot that is planned."""
+        """All planned shots."""
 
     @property
     def skipped(self) -> Mapping[str, str]:
-        """Why tuners cannot be used here, by label."""
+        """Reasons why tuners cannot be used here, by label."""
 
 
 def finish(study: Shots, say: Callable[[str], None]) -> int:
-    """Write and say what the shots in a study's folder came to.
+    """Write tables, figures and HTML report from the shots that exist.
+
+    Args:
+        study: the study to report.
+        say: prints a line.
 
     Returns:
-        How many times a method crashed or took too long.
+        Number of methods and shots that crashed or exceeded their time.
     """
     folder = study.folder
     kept = {}
@@ -81,7 +85,7 @@ def finish(study: Shots, say: Callable[[str], None]) -> int:
         return 0
     rows = pd.DataFrame([row for shot in kept.values() for row in shot["rows"]])
     for name in _NUMBERS:
-        # A column that is empty throughout has no type of its own.
+        # A column that is empty has no numeric type.
         rows[name] = pd.to_numeric(rows[name])
     lines = marked(table(rows), study.experiment)
     rows = marked(rows, study.experiment)
@@ -96,7 +100,7 @@ def finish(study: Shots, say: Callable[[str], None]) -> int:
     write(folder / REPORT, shot_page(study.experiment, str(folder), lines, rows, pictures))
     for example in examples(study.deals, kept, rows)[:1]:
         figures.append(animate(folder, study.settings, example, kept, study.experiment.trusted))
-    # Every new folder has one for a journal, which a bounce shot does not keep.
+    # Every new folder has an empty journal folder, which a bounce-shot study does not use.
     journal = folder / FOLDER
     if journal.is_dir() and not any(journal.iterdir()):
         journal.rmdir()
@@ -120,7 +124,7 @@ def _say_faults(
 
 
 def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
-    """Rows of status.csv: a line a method and shot, and one a tuner that could not be used."""
+    """Build the rows of status.csv: one per method and shot, and one per tuner that was skipped."""
     made = pd.DataFrame(
         {
             "run": rows["method"] + "/" + rows["shot"],
@@ -134,7 +138,7 @@ def _statuses(rows: pd.DataFrame, skipped: Mapping[str, str]) -> pd.DataFrame:
             "seconds": rows["seconds"],
         }
     )
-    # An empty frame beside it would change the types of the columns.
+    # Concatenating an empty frame would change the types of the columns.
     if not skipped:
         return made
     left = [

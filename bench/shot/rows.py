@@ -1,8 +1,7 @@
-"""A recorded drop for tuners that get the film's pixel rows and not metres: they never learn where
-the camera stood.
+"""Recorded drop as pixel rows, for tuners that use the film without the camera's position.
 
-They tune simulator `ball-filmed`. It is given what the scene of a drop tells: how large the ball is
-and how high it was let go; cameras and balls of all the kinds that are shot are drawn for training.
+They tune the simulator `ball-filmed`. It knows the radius of the ball and its drop height. For
+training, cameras and balls of all kinds are drawn at random.
 """
 
 from __future__ import annotations
@@ -20,11 +19,16 @@ from sims.recording.recording import Recording
 from sims.shot.balls import ball_named
 
 ROW = "v"
-"""The channel of the ball's row in the picture, pixels from above."""
+"""Channel of the ball's row in the picture, pixels from above."""
 
 
 def before_a_camera(experiment: Experiment, settings: Settings) -> Experiment:
-    """The experiment with the ball before a camera, neither of which is known."""
+    """Make the experiment for a ball in front of an unknown camera.
+
+    Args:
+        experiment: the experiment.
+        settings: its [shot] table.
+    """
     radii = [ball_named(name).radius for name in settings.balls]
     return experiment.chosen(
         simulator="ball-filmed",
@@ -44,17 +48,18 @@ def before_a_camera(experiment: Experiment, settings: Settings) -> Experiment:
 
 
 def rows_of(recording: Recording, experiment: Experiment, radius: float) -> Side:
-    """The tracker's rows on the experiment's sample times, empty where it saw nothing, and the drop
-    they show.
+    """Convert tracked rows to observations at the experiment's sample times.
+
+    Samples in which the tracker saw nothing are NaN.
 
     Args:
         recording: a tracked drop, with the rows as extra column `v`.
-        experiment: as `before_a_camera` gives it.
-        radius: of the ball, m.
+        experiment: the experiment as returned by `before_a_camera`.
+        radius: radius of the ball, m.
     """
     (run,) = recording.runs
     times: Array = np.arange(experiment.sampling.samples) / experiment.sampling.rate
-    # The recording may begin later or skip some; each row goes to the sample whose time it has.
+    # The recording may begin later or skip samples; each row is assigned by its time.
     at = np.rint(run.times * experiment.sampling.rate).astype(np.intp)
     kept = at < times.size
     observed: Array = np.full((times.size, 2), np.nan)
@@ -62,6 +67,6 @@ def rows_of(recording: Recording, experiment: Experiment, radius: float) -> Side
     z = run.channels["z"]
     first = int(np.flatnonzero(np.isfinite(z))[0])
     gravity = recording.constants["gravity"]
-    # It was let go at rest at t = 0 and may have been seen later: z(t) = z(0) - g t^2 / 2.
+    # Released at rest at t = 0, and possibly first seen later: z(t) = z(0) - g t^2 / 2.
     height = float(z[first] + 0.5 * gravity * run.times[first] ** 2)
     return Side((Scenario(times, {"z": height}, {}, {"radius": radius}),), observed)

@@ -1,6 +1,4 @@
-"""The [shot] table of an experiment: what is shot, at what, and what the planner takes for
-known.
-"""
+"""The [shot] table of an experiment: balls, scene, and assumptions of the planner."""
 
 from __future__ import annotations
 
@@ -52,10 +50,10 @@ class Settings:
 
 
 def settings_of(experiment: Experiment) -> Settings:
-    """The settings of an experiment, its defaults filled in.
+    """Read and validate the [shot] table of an experiment, with defaults.
 
     Raises:
-        InputError: an unknown entry, or a value of another kind.
+        InputError: an unknown entry, or a value of a wrong type.
     """
     source, hints = f"experiment {experiment.name}", hints_of(Settings)
     known(f"entry of [shot] in {source}", experiment.shot, hints)
@@ -67,22 +65,26 @@ def settings_of(experiment: Experiment) -> Settings:
     if not settings.balls:
         raise InputError(f"{source}: shot.balls: expected at least one ball")
     for ball in settings.balls:
-        ball_named(ball)  # refuses one that there is not
+        ball_named(ball)  # raises an error if the ball is unknown
     if settings.rows and not settings.filmed:
         raise InputError(f"{source}: shot.rows: only a film has pixel rows; set shot.filmed too")
-    # A registered tuner need not be one of the experiment's: the command line may add it.
+    # Tuners in shot.rows need not be in the experiment: the command line may add them.
     there = {*(entry.label for entry in experiment.tuners), *tuners.names()}
     known(f"tuner in shot.rows of {source}", settings.rows, there)
     return settings
 
 
 def _value(source: str, where: str, value: Any, declared: Any) -> Any:
-    """A value as the field of its name is declared; every number here is a size or lies ahead."""
+    """Convert a value to the type of its field; numbers must not be negative.
+
+    Raises:
+        InputError: the value has a wrong type or range.
+    """
     if declared == tuple[str, ...]:
         return names(source, where, value)
     if declared == Pair:
         low, high = ends(source, where, value)
-        if not 0 <= low <= high:  # both ends alike leave nothing to chance
+        if not 0 <= low <= high:  # equal ends define a constant
             raise fault(source, where, "0 <= low <= high", value)
         return low, high
     wanted = "a number of at least 0"

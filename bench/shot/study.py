@@ -1,4 +1,4 @@
-"""A bounce shot in its folder: drops are recorded, every method plans, shots are made and kept."""
+"""Bounce-shot study in its result folder: record drops, plan with every method, store the shots."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ Say = Callable[[str], None]
 
 
 class BounceShotStudy:
-    """Shots x methods, kept in a folder; fulfils `bench.study.Study`.
+    """Study of shots by several methods, stored in a folder; implements `bench.study.Study`.
 
     Args:
-        folder: of a bounce shot.
+        folder: result folder of a bounce-shot study.
 
     Attributes:
-        folder: where everything lies.
-        configuration: what it is for.
+        folder: result folder.
+        configuration: stored configuration of the study.
         plugins: plugin files that its tuners need.
 
     Raises:
-        InputError: it is no such folder, or it is damaged.
+        InputError: the folder does not contain such a study, or it is damaged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -64,8 +64,14 @@ class BounceShotStudy:
         jobs: int = 2,
         salt: str | None = None,
     ) -> BounceShotStudy:
-        """A bounce shot in a new folder; nothing has been dropped yet; see
-        `bench.study.Study.begin`.
+        """Create a study in a new folder, without running it; see `bench.study.Study.begin`.
+
+        Args:
+            experiment: experiment with a [shot] table.
+            plugins: plugin files that its tuners need.
+            folder: new result folder; None for the default one.
+            jobs: number of worker processes that will be used; 0 runs everything in this process.
+            salt: random string from which shots are drawn; see `bench.study.Study.begin`.
         """
         from bench.runs.identity import fingerprint
 
@@ -76,7 +82,7 @@ class BounceShotStudy:
                 f'experiment {experiment.name}: a shot needs simulator = "ball" and observe = ["z"]'
             )
         new = begun(experiment, folder, jobs, salt)
-        # Before there is a folder: a fault of the user's leaves nothing behind.
+        # Validated before the folder is created: an error of the user leaves no files.
         check(new.experiment)
         if jobs:
             refuse_unreachable(new.experiment)
@@ -84,8 +90,11 @@ class BounceShotStudy:
 
     @classmethod
     def resume(cls, folder: Path, plugins: Sequence[str] = ()) -> BounceShotStudy:
-        """A bounce shot that was interrupted: what is kept stays, what is missing remains; see
-        `bench.study.Study.resume`.
+        """Open an interrupted study to run what is missing; see `bench.study.Study.resume`.
+
+        Args:
+            folder: result folder.
+            plugins: further plugin files.
         """
         from bench.runs.identity import unchanged
 
@@ -96,14 +105,14 @@ class BounceShotStudy:
 
     @cached_property
     def skipped(self) -> dict[str, str]:
-        """The tuners that cannot be used here, by label, and why."""
+        """Tuners that cannot be used here, by label, with the reason."""
         return check(self.configuration.experiment)
 
     @cached_property
     def experiment(self) -> Experiment:
-        """What is shot, with the tuners that can be used."""
+        """The experiment, with the tuners that can be used."""
         whole = self.configuration.experiment
-        # Their lines would be empty; finish says why they are not there.
+        # Skipped tuners would have empty lines; `finish` reports why they are missing.
         labels = [entry.label for entry in whole.tuners if entry.label not in self.skipped]
         return whole.with_tuners(labels)
 
@@ -114,7 +123,7 @@ class BounceShotStudy:
 
     @cached_property
     def deals(self) -> list[Deal]:
-        """All shots."""
+        """All shots of the study."""
         experiment = self.configuration.experiment
         salt = kept(self.folder, experiment) or experiment.salt
         return deals(experiment, self.settings, salt)
@@ -122,8 +131,12 @@ class BounceShotStudy:
     def make(
         self, jobs: int = 2, progress: Progress | None = None, pool: Pool | None = None
     ) -> Made:
-        """Make what is missing; see
-        `bench.study.Study.make`.
+        """Execute the missing shots; see `bench.study.Study.make`.
+
+        Args:
+            jobs: number of worker processes.
+            progress: makes progress callbacks; None for no progress output.
+            pool: worker pool; None to create one.
         """
         if reason := world.missing():
             return self._made(skipped=reason)
@@ -133,7 +146,7 @@ class BounceShotStudy:
             left = missing(self.folder, self.deals)
             if left:
                 _Making(self, left, progress or silent).run(jobs, pool)
-        except KeyboardInterrupt:  # the balls take turns, so what there is tells of all of them
+        except KeyboardInterrupt:  # the kinds of balls alternate, so a partial result covers all
             return self._made(interrupted=True)
         except LostError as error:
             return self._made(stopped=str(error))
@@ -148,10 +161,10 @@ class BounceShotStudy:
         return Made(len(self.deals) - len(left), len(self.deals), **why)
 
     def close(self) -> None:
-        """Let go of the folder; a shot's holds nothing open."""
+        """Close the study; it holds no open files."""
 
     def status(self) -> Standing:
-        """Which shots the folder holds and which are missing.
+        """Return which shots are stored and which are missing.
 
         Raises:
             InputError: the file of a shot is damaged.
@@ -166,10 +179,13 @@ class BounceShotStudy:
         return Standing(held.experiment.name, "shots made", held.fingerprint, ends)
 
     def finish(self, say: Say) -> int:
-        """Write tables and figures of what there is, and say what came out.
+        """Write tables, figures and HTML report, and print a summary.
+
+        Args:
+            say: prints a line.
 
         Returns:
-            How many times a method failed.
+            Number of failures of methods.
 
         Raises:
             InputError: the file of a shot is damaged.
@@ -180,7 +196,7 @@ class BounceShotStudy:
 
 
 class _Making:
-    """The work on the shots that are missing, one stage after another."""
+    """Execution of the missing shots, in several stages."""
 
     def __init__(self, study: BounceShotStudy, left: list[Deal], progress: Progress) -> None:
         self._study, self._left, self._progress = study, left, progress
@@ -192,18 +208,23 @@ class _Making:
         self._paths = [study.folder / RECORDINGS / f"{one.name}.csv" for one in left]
 
     def run(self, jobs: int, pool: Pool | None) -> None:
-        """Record the drops, train, tune and plan, make the shots.
+        """Record the drops, train tuners, tune and plan, and execute the shots.
+
+        Args:
+            jobs: number of worker processes.
+            pool: worker pool; None to create one.
 
         Raises:
-            LostError: what makes the calls is gone.
-            WeightsError: trained weights are there and damaged.
+            LostError: the workers are no longer available.
+            WeightsError: stored trained weights are damaged.
         """
         for name in (SHOTS, RECORDINGS):
             (self._study.folder / name).mkdir(exist_ok=True)
-        # These workers know the balls, and tune nothing; those that tune are others.
+        # These workers know the true balls and run no tuner; other workers run the tuners.
         with pool_of(jobs) as workers:
             faults = self._record(workers)
-        # Here are the true balls, and a tuner's process may be this user's.
+        # The true balls are in the memory of this process, and a tuner's process may run as the
+        # same user.
         hidden = nullcontext() if self._experiment.trusted else memory_hidden()
         with hidden, pool or pool_of(jobs) as workers:
             workers.load(admitted(self._study.plugins, self._experiment))
@@ -211,7 +232,11 @@ class _Making:
             self._shoot(workers, faults, weights)
 
     def _record(self, workers: Pool) -> dict[int, BaseException]:
-        """Record every drop; returns what went wrong, by place."""
+        """Record every drop.
+
+        Returns:
+            Errors by index of the shot.
+        """
         calls: list[Call] = [
             (record, (self._experiment, one, self._settings, path))
             for one, path in zip(self._left, self._paths, strict=True)
@@ -225,10 +250,13 @@ class _Making:
         return faults
 
     def _train(self, workers: Pool) -> dict[str, Path]:
-        """The files of the learned tuners' weights, by label.
+        """Train the tuners that need training.
+
+        Returns:
+            Files of the trained weights, by label.
 
         Raises:
-            Exception: a training failed; an untrained tuner must not be taken for a trained one.
+            Exception: a training failed; an untrained tuner must not be used as a trained one.
         """
         learned = [e for e in self._experiment.tuners if tuners.get(e.tuner).learned]
         grounds = [tune.tuned_in(self._experiment, self._settings, entry) for entry in learned]
@@ -248,7 +276,7 @@ class _Making:
     def _shoot(
         self, workers: Pool, faults: dict[int, BaseException], weights: dict[str, Path]
     ) -> None:
-        """Have every method tune and plan, and make the shots."""
+        """Tune and plan with every method, and execute the shots."""
         seen = [place for place in range(len(self._left)) if place not in faults]
         calls: list[Call] = []
         for place in seen:
@@ -276,8 +304,9 @@ class _Making:
 def _failed(
     experiment: Experiment, error: BaseException, status: str = "crashed"
 ) -> list[dict[str, Any]]:
-    """The models of a shot whose drop could not be recorded, or whose worker died or took too long:
-    none has a plan.
+    """Make failed models for a shot without a recording, or whose worker died or was too slow.
+
+    None of them has a plan.
     """
     if isinstance(error, TimeoutError):
         status = "timeout"

@@ -1,6 +1,4 @@
-"""What came of the shots: hits by ball and method with Wilson's interval, and how near the plans
-were.
-"""
+"""Results table of a bounce-shot study: hits with Wilson intervals, and prediction errors."""
 
 from __future__ import annotations
 
@@ -11,7 +9,7 @@ import pandas as pd
 from bench.store.status import FAILED
 
 ALL = "all"
-"""Stands for all kinds of balls together."""
+"""Value of the column ball for all kinds of balls together."""
 COLUMNS = [
     "method",
     "ball",
@@ -29,30 +27,40 @@ COLUMNS = [
     "failures",
 ]
 NO_SHOT = (*FAILED, "no plan", "no recording")
-"""Statuses of a method that did not come to a shot, or to one that was planned in a tuned model."""
+"""Statuses of a method without a shot, or without one that was planned in a tuned model."""
 
 
 def wilson(hits: int, shots: int, z: float = 1.959963984540054) -> tuple[float, float]:
-    """95 % score interval of a share p of n shots (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927,
-    doi:10.2307/2276774).
+    """Compute the 95 % score interval of a proportion by Wilson's method.
+
+    For a proportion p of n shots (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927,
+    doi:10.2307/2276774):
 
         centre = (p + z^2 / 2n) / (1 + z^2 / n)                                  (1)
         half = z / (1 + z^2 / n) sqrt(p (1 - p) / n + z^2 / 4n^2)                (2)
+
+    Args:
+        hits: number of hits.
+        shots: number of shots.
+        z: quantile of the normal distribution.
+
+    Returns:
+        Lower and upper bound; NaN without shots.
     """
     if shots < 1:
         return float("nan"), float("nan")
     share, n = hits / shots, float(shots)
     centre = (share + z * z / (2 * n)) / (1 + z * z / n)  # (1)
     half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))  # (2)
-    # Rounding may lead a hair beyond what a share can be.
+    # Rounding errors may exceed the range of a proportion slightly.
     return max(0.0, centre - half), min(1.0, centre + half)
 
 
 def table(rows: pd.DataFrame) -> pd.DataFrame:
-    """One line a method and ball, and a method and all balls; distances in m.
+    """Build the results table: one line per method and ball, and one per method for all balls.
 
-    `off` is the distance from the hoop's centre, where its plane was met; a shot that never met it
-    is infinitely far.
+    Distances are in m. `off` is the distance from the hoop's centre in the plane of the hoop; it is
+    infinite for a shot that never meets the plane.
     """
     lines = []
     for method, part in rows.groupby("method", sort=False):
@@ -66,7 +74,7 @@ def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
     off = part["off"].abs().fillna(math.inf)
     errors = part["prediction_error"]
     failures = int(part["status"].isin(NO_SHOT).sum())
-    # Not interpolated: between a metre and infinity there is no number.
+    # Not interpolated, because values may be infinite.
     near = off.quantile([0.5, 0.9], interpolation="higher").tolist()
     return [
         method,
@@ -85,7 +93,7 @@ def _line(method: str, ball: str, part: pd.DataFrame) -> list[object]:
 
 
 def text(lines: pd.DataFrame) -> str:
-    """The table for the terminal: hits by ball, share with interval, prediction error."""
+    """Format the table for the terminal: hits by ball, hit rate with interval, prediction error."""
     balls = [ball for ball in lines["ball"].unique() if ball != ALL]
     width = max(len(m) for m in lines["method"])
     head = (

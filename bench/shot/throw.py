@@ -1,4 +1,4 @@
-"""Makes a planned shot in the world, and says how near the plan came."""
+"""Execute a planned shot in the true world, and compute the prediction error."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ from sims.shot.scene import crossings
 from sims.shot.world import Ground, fly
 
 RATE = 240.0
-"""Samples a second at which a shot is followed, Hz."""
+"""Sampling rate of a shot, Hz."""
 SECONDS = 3.0
-"""For so long a shot is followed, s."""
+"""Maximum duration of a shot, seconds."""
 
 
 @dataclass(frozen=True)
 class Throw:
-    """One shot.
+    """Result of one shot.
 
     Attributes:
-        hit: the centre came through the hoop.
-        off: where it came through the hoop's plane, m from the centre along x, > 0 beyond it; NaN
-            for never.
-        prediction_error: mean distance in m between the planned and the flown centre at the same
-            instants, from the release until the plan or the ball has come through the hoop's plane,
-            whichever is first.
-        times: (T,) seconds.
-        planned: (T, 3), NaN where there was no plan.
-        flown: (T, 3).
+        hit: whether the centre passed through the hoop.
+        off: where the centre passed the hoop's plane, m from the hoop's centre along x, > 0 beyond
+            it; NaN if it did not.
+        prediction_error: mean distance in m between the planned and the flown centre at equal
+            times, from the release until one of them has passed the hoop's plane.
+        times: times, seconds, (T,).
+        planned: planned path, (T, 3); NaN if there was no plan.
+        flown: flown path, (T, 3).
     """
 
     hit: bool
@@ -48,16 +47,22 @@ class Throw:
 
 
 def throw(dealt: Deal, settings: Settings, model: TunedModel) -> Throw:
-    """Make the planned shot, with the shot's release error."""
+    """Execute a planned shot, with the shot's release error.
+
+    Args:
+        dealt: the shot.
+        settings: the [shot] table.
+        model: tuned model with the plan.
+    """
     times = np.arange(round(SECONDS * RATE) + 1) / RATE
-    # No plan, no shot; which is a miss.
+    # Without a plan, the shot is a miss.
     if not math.isfinite(model.height):
         nothing = np.full((times.size, 3), np.nan)
         return Throw(False, float("nan"), float("nan"), times, nothing, nothing)
     heights = np.array([model.height])
     known = constants_of(settings, dealt.ball.radius)
     planned = flights(simulator_of(model), theta_of(model), dealt.scene, known, heights, times)[0]
-    # From here on with what the planner did not know: the ball, the friction, the release.
+    # The true ball, friction and release, which the planner does not know.
     ground = Ground(dealt.scene.angle, settings.friction)
     start = (
         dealt.release[0],
@@ -68,25 +73,32 @@ def throw(dealt: Deal, settings: Settings, model: TunedModel) -> Throw:
     x, y = crossings(flown[None], dealt.scene)[0].tolist()
     off = x - dealt.scene.hoop_x
     hit = math.hypot(off, y) < dealt.scene.hoop_radius
-    # Behind the hoop's plane nothing was planned.
+    # Beyond the hoop's plane, nothing was planned.
     last = min(_through(planned, dealt.scene.hoop_z), _through(flown, dealt.scene.hoop_z))
     error = float(np.linalg.norm(planned - flown, axis=1)[: last + 1].mean())
     return Throw(hit, off, error, times, planned, flown)
 
 
 def _through(path: Array, height: float) -> int:
-    """Index of the sample after which a path comes down through a height after its bounce; its end
-    if never.
+    """Return the index of the sample after which a path descends through a height after its bounce.
+
+    If it does not, return the last index.
     """
     z = path[:, 2]
-    # Before its bounce the ball falls through the same heights.
+    # Before its bounce, the ball falls through the same heights.
     risen = np.logical_or.accumulate(z[1:] > z[:-1])
     down = np.flatnonzero(risen & (z[:-1] > height) & (z[1:] <= height))
     return int(down[0]) if down.size else len(z) - 1
 
 
 def thrown(dealt: Deal, settings: Settings, made: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One row a method: what was planned and what became of it."""
+    """Execute the shot of each method, and build the result rows.
+
+    Args:
+        dealt: the shot.
+        settings: the [shot] table.
+        made: fields of the tuned model of each method.
+    """
     return [
         _row(dealt, model, throw(dealt, settings, model))
         for model in (TunedModel(**row) for row in made)

@@ -1,10 +1,9 @@
-"""From the recording of a drop to tuned models and planned shots. Nothing in here knows the ball
-that was dropped.
+"""Tuned models from the recording of a drop, and the shot planned in each.
 
-The models are those of the tuners, in the simulator as it is and in the one that `explain` extended
-from the same recording, and `explain`'s own fit. Heights are shifted as if every ball had the
-radius of the experiment, so that a network trained once serves all; tuners on vision get pixel rows
-instead (`bench.shot.rows`).
+No code in this module uses the true ball. The models are those of the tuners, in the original
+simulator and in the one that `explain` extended from the same recording, and the fit of `explain`
+itself. Heights are shifted as if every ball had the radius of the experiment, so that one trained
+network serves all balls. Vision tuners get pixel rows instead (`bench.shot.rows`).
 """
 
 from __future__ import annotations
@@ -35,28 +34,28 @@ from sims.shot.simulator import BounceShot
 from sims.shot.system import ShotSystem
 
 NOMINAL = "nominal"
-"""The method that tunes nothing."""
+"""Method without tuning."""
 EXPLAINED = "explain"
-"""The method that takes explain's own fit."""
+"""Method that uses the fit of explain itself."""
 AFTER = " + explain"
-"""Behind the label of a tuner that tunes the simulator that explain extended."""
+"""Suffix of the label of a tuner that tunes the simulator extended by explain."""
 Effects = Mapping[str, Sequence[float]]
 
 
 @dataclass(frozen=True)
 class TunedModel:
-    """A tuned simulator and the shot planned in it.
+    """Tuned simulator and the shot planned in it.
 
     Attributes:
-        method: label.
-        restitution: tuned.
-        effects: coefficients of the effects it was extended with and that act on the shot.
-        simulations: used on this target.
-        seconds: taken.
-        status: as in status.csv; ``no plan`` where the model reaches the hoop from no height.
-        reason: in words.
-        height: planned drop height, m; NaN where there is none.
-        margin: to the rim, as planned, m.
+        method: label of the method.
+        restitution: tuned restitution.
+        effects: coefficients of the effects that explain added and that act on the shot.
+        simulations: number of simulations used on this target.
+        seconds: time used.
+        status: as in status.csv; ``no plan`` if the model reaches the hoop from no height.
+        reason: explanation of the status.
+        height: planned drop height, m; NaN if there is none.
+        margin: planned distance to the rim, m.
     """
 
     method: str
@@ -72,15 +71,15 @@ class TunedModel:
 
 @dataclass(frozen=True)
 class Known:
-    """What a method gets of a shot.
+    """Input of a method for a shot.
 
     Attributes:
-        name: of the shot.
-        recording: of the ball's drop.
+        name: name of the shot.
+        recording: recording of the ball's drop.
         scene: incline and hoop.
         weights: files of trained weights, by tuner.
-        tuned: which tuner lives in a process of its own, by label.
-        hidden: folders that it must not reach.
+        tuned: specifications of the tuners that run in isolated processes, by label.
+        hidden: folders that isolated tuners must not read.
     """
 
     name: str
@@ -91,20 +90,29 @@ class Known:
     hidden: tuple[str, ...] = ()
 
     def files(self) -> tuple[Path, ...]:
-        """What must travel with it to another machine."""
+        """List the files that another machine needs."""
         plugins = {Path(tuned.file) for tuned in self.tuned.values() if tuned.file}
         described = self.recording.with_suffix(".toml")
         return self.recording, described, *self.weights.values(), *sorted(plugins)
 
     def moved(self, places: Mapping[Path, Path]) -> Known:
-        """The same where its files have other places."""
+        """Return a copy for another machine, where the files have other paths."""
         weights = {label: places[path] for label, path in self.weights.items()}
         tuned = {label: elsewhere(one, places) for label, one in self.tuned.items()}
         return replace(self, recording=places[self.recording], weights=weights, tuned=tuned)
 
 
 def models(experiment: Experiment, settings: Settings, known: Known) -> list[dict[str, Any]]:
-    """Every method's model and plan, as plain dictionaries."""
+    """Tune all methods to a recording, and plan a shot with each.
+
+    Args:
+        experiment: the experiment.
+        settings: its [shot] table.
+        known: input of the methods.
+
+    Returns:
+        Fields of a `TunedModel` for each method.
+    """
     recording = read_recording(known.recording, BallSimulator, whole=True)
     made = [TunedModel(NOMINAL, _nominal(), {}, 0, 0.0, "done")]
     made += [
@@ -112,7 +120,7 @@ def models(experiment: Experiment, settings: Settings, known: Known) -> list[dic
     ]
     explained, acting = _explained(known.recording)
     made.append(explained)
-    # What explain could not extend cannot be tuned in its extension.
+    # If explain failed, there is no extended simulator to tune.
     if explained.status == "done":
         again = [
             _tuned(experiment, settings, entry, known, recording, acting)
@@ -138,7 +146,7 @@ def _tuned(
     recording: Recording,
     effects: Effects,
 ) -> TunedModel:
-    """The model of a tuner, in the simulator with these effects."""
+    """Run a tuner in the simulator with given effects."""
     label, radius = entry.label, _constants(recording)["radius"]
     experiment = tuned_in(experiment, settings, entry)
     if effects:
@@ -175,22 +183,29 @@ def _tuned(
 
 
 def tuned_in(experiment: Experiment, settings: Settings, entry: Entry) -> Experiment:
-    """The experiment as a tuner gets it: heights, or simulated heights and pixel rows."""
+    """Adapt the experiment to a tuner: to pixel rows if the tuner uses them.
+
+    Args:
+        experiment: the experiment.
+        settings: its [shot] table.
+        entry: the tuner.
+    """
     return before_a_camera(experiment, settings) if entry.label in settings.rows else experiment
 
 
 def _side(recording: Recording, experiment: Experiment) -> Side:
-    """The recorded run as the experiment's simulator sees it: let go at rest at time 0, whenever it
-    is seen first.
+    """Convert the recorded run to fitting data of the experiment's simulator.
+
+    The ball is released at rest at time 0, even if it is first seen later.
     """
     (run,) = recording.runs
     scenario = scenario_of(run, BallSimulator(observe=["z"]), recording.constants)
-    # As if the ball had the experiment's radius: one network serves balls of all sizes.
+    # The radius of the experiment replaces that of the ball: one network serves balls of all sizes.
     radius = experiment.fixed["radius"]
     shift = radius - _constants(recording)["radius"]
     z = run.channels["z"] + shift
     seen = run.channels["z"][np.isfinite(run.channels["z"])]
-    # Let go at rest at t = 0, it has the speed g t when it is seen first.
+    # Released at rest at t = 0, the ball has the speed g t when it is first seen.
     fallen = scenario.constants.get("gravity", _constants(recording)["gravity"]) * float(
         run.times[0]
     )
@@ -201,18 +216,22 @@ def _side(recording: Recording, experiment: Experiment) -> Side:
 
 
 def _constants(recording: Recording) -> dict[str, float]:
-    """Of the recorded run, the system's where the recording states none."""
+    """Return the constants of the recorded run, with defaults of the system."""
     return {**BallSimulator().constant_values, **recording.constants, **recording.runs[0].constants}
 
 
 def _explained(recording: Path) -> tuple[TunedModel, Effects]:
-    """The model of explain, with the effects that act on the shot, and all that it found."""
+    """Run explain on the recording.
+
+    Returns:
+        Its model, with the effects that act on the shot, and all effects that it found.
+    """
     from bench.gap.explain import explain
 
     started = perf_counter()
     try:
         found = explain(recording)
-    except Exception:  # a failure of one method is a row of the table
+    except Exception:  # the failure of one method is a row of the table
         last = traceback.format_exc()
         return TunedModel(
             EXPLAINED, _nominal(), {}, 0, perf_counter() - started, "crashed", last
@@ -231,17 +250,21 @@ def _explained(recording: Path) -> tuple[TunedModel, Effects]:
 
 
 def carry(effects: Effects, gravity: float) -> dict[str, tuple[float, ...]]:
-    """The effects of a drop that act on a shot: what belongs to the ball and the air, not to the
-    camera.
+    """Select the effects of a drop that act on a shot.
 
-    A constant force along the vertical is a change of gravity, and goes over as that.
+    They are effects of the ball and the air, not of the camera. A constant vertical force is
+    converted to a change of gravity.
+
+    Args:
+        effects: coefficients by name.
+        gravity: gravitational acceleration, m/s^2.
     """
     from sims import effects as library
 
     carried: dict[str, tuple[float, ...]] = {}
     for name, values in effects.items():
         kind = library.get(name)
-        # Per unit mass and along z: a force c is a change of gravity by -c / g.
+        # A constant acceleration c along z is a change of gravity by -c / g.
         if name == "force.bias":
             carried["gravity.scale"] = (-values[0] / gravity,)
         elif kind.hook in ("force", "contact") and kind.fits(ShotSystem):
@@ -250,12 +273,17 @@ def carry(effects: Effects, gravity: float) -> dict[str, tuple[float, ...]]:
 
 
 def simulator_of(model: TunedModel) -> BounceShot:
-    """The planning simulator of a model."""
+    """Make the planning simulator of a model."""
     return BounceShot(fixed={name: list(values) for name, values in model.effects.items()})
 
 
 def constants_of(settings: Settings, radius: float) -> dict[str, float]:
-    """What the planner takes for known of a ball."""
+    """Return the constants of a ball that the planner assumes.
+
+    Args:
+        settings: the [shot] table.
+        radius: radius of the ball, m.
+    """
     return {
         "radius": radius,
         "friction": settings.planned_friction,
@@ -264,12 +292,19 @@ def constants_of(settings: Settings, radius: float) -> dict[str, float]:
 
 
 def theta_of(model: TunedModel) -> Array:
-    """The parameters of a model's planning simulator."""
+    """Return the parameters of a model's planning simulator."""
     return np.array([model.restitution])
 
 
 def planned_in(model: TunedModel, settings: Settings, scene: ShotScene, radius: float) -> Plan:
-    """The shot planned in a model."""
+    """Plan a shot in a model.
+
+    Args:
+        model: the tuned model.
+        settings: the [shot] table.
+        scene: incline and hoop.
+        radius: radius of the ball, m.
+    """
     known = constants_of(settings, radius)
     return plan(simulator_of(model), theta_of(model), scene, known, settings.heights)
 

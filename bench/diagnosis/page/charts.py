@@ -1,4 +1,4 @@
-"""The charts of a comparison of diagnosers; their numbers are those of its tables."""
+"""Interactive charts of the report of a comparison of diagnosers, drawn from its tables."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _SHARES = (
     ("foreign causes: unknown or partial", "foreign"),
     ("95 % intervals that hold", "intervals"),
 )
-"""Metrics of the chart of shares and what stands below it."""
+"""Metrics of the chart of fractions, each with its label on the axis."""
 _SHARE = (-0.03, 1.03)
-"""Ends of an axis of shares."""
+"""Limits of an axis of fractions."""
 _WILSON = "Bars: 95 % (Wilson)."
 
 
 def board_chart(shown: Shown, page: Page) -> str:
-    """False alarms against what is named."""
+    """Render the chart of diagnosed single causes against false alarms."""
     table = shown.tables["table"]
     parts = {
         metric: table[table["metric"] == metric].set_index("diagnoser")
@@ -63,7 +63,7 @@ def board_chart(shown: Shown, page: Page) -> str:
 
 
 def shares_chart(shown: Shown, page: Page) -> str:
-    """Every share of the table, side by side."""
+    """Render the chart of all fractions of table.csv, one category per metric."""
     table = shown.tables["table"]
     there = [(m, says) for m, says in _SHARES if table.loc[table["metric"] == m, "of"].any()]
     if not there:
@@ -87,7 +87,7 @@ def shares_chart(shown: Shown, page: Page) -> str:
 
 
 def power_chart(shown: Shown, page: Page) -> str:
-    """What is named and seen against the size of the effect."""
+    """Render the fractions diagnosed and detected against the size of the hidden effect."""
     frame = shown.tables["power"]
     if frame.empty:
         return ""
@@ -109,7 +109,7 @@ def power_chart(shown: Shown, page: Page) -> str:
 
 
 def calibration_chart(shown: Shown, page: Page) -> str:
-    """How often p values fall below a level where nothing is hidden."""
+    """Render the fraction of clean recordings whose p-value is below a level, against the level."""
     frame = shown.tables["calibration"]
     if frame.empty:
         return ""
@@ -131,7 +131,7 @@ def calibration_chart(shown: Shown, page: Page) -> str:
 
 
 def sets_chart(shown: Shown, page: Page) -> str:
-    """Answers by the size of their largest set: how many there are, and how many hold the truth."""
+    """Render the number and correctness of answers by the size of their largest set of causes."""
     frame = shown.tables["sets"]
     if not frame["of"].any():
         return ""
@@ -158,7 +158,7 @@ def sets_chart(shown: Shown, page: Page) -> str:
 
 
 def cost_chart(shown: Shown, page: Page) -> str:
-    """What an answer costs against what is named."""
+    """Render the chart of diagnosed single causes against the cost of an answer."""
     table, costs = shown.tables["table"], shown.tables["costs"]
     named = table[(table["metric"] == NAMED) & (table["of"] > 0)]
     frame = named.merge(costs, on="diagnoser")
@@ -180,7 +180,7 @@ def cost_chart(shown: Shown, page: Page) -> str:
 
 
 def _learned(costs: pd.DataFrame) -> str:
-    """Who has learned from how many simulations before it was asked."""
+    """Say how many training simulations each trained diagnoser has used."""
     told = costs[costs["training_simulations"] > 0]
     return " ".join(
         f"{safe(name, 60)} has learned from {count:,} simulations before.".replace(",", " ")
@@ -189,7 +189,13 @@ def _learned(costs: pd.DataFrame) -> str:
 
 
 def pictures(shown: Shown, page: Page, *names: tuple[str, str, str]) -> str:
-    """Figures that are the same on the screen: name, title, how to read it."""
+    """Render figures that have no interactive version.
+
+    Args:
+        shown: data of the report.
+        page: page that receives the figures.
+        *names: name, title and caption of each figure.
+    """
     parts = []
     for name, title, caption in names:
         if still := shown.still(name, caption):

@@ -1,4 +1,4 @@
-"""What the page of a comparison of diagnosers says first, in sentences."""
+"""Headline sentences and warnings of the report of a comparison of diagnosers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bench.pages.elements import code, safe, strong
 from bench.pages.text import percent, probability
 
 _SURE = 0.05
-"""Holm-corrected probability below which two diagnosers are told apart."""
+"""Maximum Holm-corrected p-value for a significant difference between two diagnosers."""
 _KINDS = {
     "clean": "false alarms in {of} clean recordings",
     "single": "of {of} single effects of at least one noise",
@@ -26,7 +26,11 @@ _KINDS = {
 
 
 def conclusion(shown: Shown) -> Iterator[str]:
-    """Safe HTML, a sentence each: simgap's failures, who leads at few alarms, who is better."""
+    """Yield the headline sentences as escaped HTML.
+
+    They state the failures of simgap, the diagnoser that identifies most causes among those with
+    few false alarms, and the diagnosers that are significantly better than simgap.
+    """
     yield from _own_failures(shown)
     yield from _leading(shown)
     yield from _better(shown)
@@ -47,7 +51,7 @@ def _own_failures(shown: Shown) -> Iterator[str]:
 
 
 def _leading(shown: Shown) -> Iterator[str]:
-    """Who names most among those that hardly alarm, and whether that is more than chance."""
+    """Yield the best diagnoser among those with few false alarms, and whether its lead is clear."""
     table = shown.tables["table"]
     alarms, named = by_diagnoser(table, "false alarms"), by_diagnoser(table, NAMED)
     if not any(line["of"] for line in alarms.values()):
@@ -72,7 +76,12 @@ def _leading(shown: Shown) -> Iterator[str]:
 
 
 def _apart(shown: Shown, best: str, others: list[str]) -> str:
-    """Whether pairs with simgap's own tell the best from the others."""
+    """Say whether simgap as the best diagnoser differs significantly from the others.
+
+    Returns:
+        One sentence, or an empty text if there are no others or if simgap is not the best: only
+        pairs with simgap are tested.
+    """
     if not others or best != OWN:
         return ""
     lines = by_diagnoser(shown.tables["pairs"], "named")
@@ -84,7 +93,7 @@ def _apart(shown: Shown, best: str, others: list[str]) -> str:
 
 
 def _better(shown: Shown) -> Iterator[str]:
-    """Who beats simgap at something, with significance."""
+    """Yield the metrics at which another diagnoser is significantly better than simgap."""
     pairs = shown.tables["pairs"]
     if pairs.empty:
         return
@@ -100,7 +109,7 @@ def _better(shown: Shown) -> Iterator[str]:
 
 
 def warnings(shown: Shown) -> Iterator[str]:
-    """What takes away from the result; safe HTML."""
+    """Yield sentences about limitations of the results, as escaped HTML."""
     if shown.experiment.trusted:
         yield f"{TRUSTED.capitalize()}."
     if shown.asked < shown.planned:
@@ -120,7 +129,14 @@ def warnings(shown: Shown) -> Iterator[str]:
 
 
 def cannot(left_out: pd.DataFrame) -> list[tuple[str, str, int]]:
-    """Diagnosers that cannot be asked some questions: name, why, how many."""
+    """Count the cases that diagnosers do not support, by diagnoser and reason.
+
+    Args:
+        left_out: rows of unsupported cases, with columns diagnoser and reason.
+
+    Returns:
+        List of (diagnoser, reason, number of cases).
+    """
     groups = left_out.groupby(["diagnoser", "reason"], sort=False).size().reset_index(name="of")
     return [(str(n), str(why), int(of)) for n, why, of in groups.itertuples(index=False)]
 

@@ -1,4 +1,4 @@
-"""The tables of a comparison of diagnosers, to be sorted and filtered."""
+"""Sortable and filterable tables of the report of a comparison of diagnosers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _COUNTED = (
 
 
 def failures_grid(shown: Shown, page: Page) -> str:
-    """Every answer that is counted and not right, at first simgap's own."""
+    """Render the table of incorrect answers, filtered to those of simgap at first."""
     frame = failures(shown.rows, shown.order)
     if frame.empty:
         return ""
@@ -40,7 +40,7 @@ def failures_grid(shown: Shown, page: Page) -> str:
 
 
 def table_grid(shown: Shown, page: Page) -> str:
-    """table.csv, at first what is named."""
+    """Render table.csv, filtered at first to the metric that counts as a diagnosed cause."""
     page.table("table", shown.tables["table"], 6)
     columns = (Column("diagnoser"), Column("metric", "what is counted"), *_COUNTED)
     only = {"metric": NAMED}
@@ -59,7 +59,7 @@ def table_grid(shown: Shown, page: Page) -> str:
 
 
 def groups_grid(shown: Shown, page: Page) -> str:
-    """groups.csv: the same by circumstances and effects."""
+    """Render groups.csv: false alarms and diagnosed causes by recording condition and effect."""
     frame = shown.tables["groups"]
     if frame.empty:
         return ""
@@ -79,7 +79,7 @@ def groups_grid(shown: Shown, page: Page) -> str:
 
 
 def pairs_grid(shown: Shown, page: Page) -> str:
-    """pairs.csv: everybody against simgap."""
+    """Render pairs.csv: each diagnoser compared with simgap."""
     frame = shown.tables["pairs"]
     if frame.empty:
         return ""
@@ -99,7 +99,7 @@ def pairs_grid(shown: Shown, page: Page) -> str:
 
 
 def confusion_grid(shown: Shown, page: Page) -> str:
-    """confusion.csv: what each effect is taken for."""
+    """Render confusion.csv: number of each answer for each hidden effect."""
     frame = shown.tables["confusion"]
     if frame.empty:
         return ""
@@ -119,7 +119,7 @@ def confusion_grid(shown: Shown, page: Page) -> str:
 
 
 def costs_grid(shown: Shown, page: Page) -> str:
-    """costs.csv."""
+    """Render costs.csv: simulations and time per answer."""
     page.table("costs", shown.tables["costs"], 6)
     columns = (
         Column("diagnoser"),
@@ -137,7 +137,7 @@ def costs_grid(shown: Shown, page: Page) -> str:
 
 
 def items_grid(shown: Shown, page: Page) -> str:
-    """items.csv: every answer."""
+    """Render items.csv: one row per answer."""
     page.table("items", shown.rows, 6)
     columns = (
         Column("question"),

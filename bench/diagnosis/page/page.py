@@ -1,4 +1,4 @@
-"""The page of a comparison of diagnosers: report.html."""
+"""Assemble report.html, the HTML report of a comparison of diagnosers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,12 @@ _CONFUSION = (
 
 
 def diagnosis_page(shown: Shown) -> str:
-    """The page as HTML: simgap's failures come first, then who is good at what, then how sure."""
+    """Render the HTML report of a comparison of diagnosers.
+
+    The sections are, in this order: failures (of simgap first, if it takes part), strengths, power,
+    confusion, calibration, costs, recording conditions, all answers, and how to repeat the
+    comparison.
+    """
     name = shown.experiment.title or shown.experiment.name
     made = f"Made by {code('simgap')} from the answers in {code(safe(shown.folder, 300))}."
     page = Page(f"{name}: comparison of diagnosers", made)

@@ -1,4 +1,4 @@
-"""What the page of a comparison of diagnosers shows."""
+"""Data from which the HTML report of a comparison of diagnosers is rendered."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from bench.problem.experiment import Experiment
 
 @dataclass(frozen=True)
 class Shown:
-    """A comparison of diagnosers as its page shows it.
+    """Data of a comparison of diagnosers that its HTML report displays.
 
     Attributes:
-        experiment: what was asked for.
-        folder: where it lies.
-        order: diagnosers, in the order of colours.
-        rows: a row an answer, of the questions that everybody was asked.
-        tables: by name, see `bench.diagnosis.tables.all_tables`.
-        training: what learning cost, a row a diagnoser and system.
-        pictures: figures by name, as they are printed.
-        skipped: diagnosers that could not be asked, and why.
-        planned: questions of the sheet.
-        left_out: rows of questions that a diagnoser cannot be asked, and that count nowhere.
+        experiment: the experiment that was run.
+        folder: result folder.
+        order: names of the diagnosers, in the order of their colours.
+        rows: one row per answer, only for cases that every diagnoser has answered.
+        tables: tables by name, see `bench.diagnosis.tables.all_tables`.
+        training: training costs, one row per diagnoser and system.
+        pictures: printed figures by name.
+        skipped: diagnosers that could not be run, with the reason.
+        planned: number of cases in the case set.
+        left_out: rows of cases that a diagnoser does not support; they count in no table.
     """
 
     experiment: Experiment
@@ -42,15 +42,22 @@ class Shown:
 
     @property
     def asked(self) -> int:
-        """Questions that everybody was asked."""
+        """Number of cases that every diagnoser has answered."""
         return int(self.rows["question"].nunique())
 
     def looks(self) -> Iterator[tuple[str, Look]]:
-        """Each diagnoser with its look."""
+        """Yield each diagnoser with its mark style (colour, dash and marker)."""
         return ((name, look(place)) for place, name in enumerate(self.order))
 
     def points(self, y: str, *, beside: bool = False, **where: str) -> tuple[Series, ...]:
-        """A row of marks with intervals for each diagnoser, side by side on a category axis."""
+        """Make one series of points with error bars for each diagnoser.
+
+        Args:
+            y: column with the value.
+            beside: whether the points of the diagnosers are shifted sideways, so that they do not
+                overlap on a category axis.
+            **where: values of further columns that select the rows of the series.
+        """
         count = len(self.order)
         return tuple(
             Series(
@@ -67,7 +74,13 @@ class Shown:
         )
 
     def lines(self, y: str, frame: pd.DataFrame, **where: str) -> tuple[Series, ...]:
-        """A line with intervals for each diagnoser that a table has."""
+        """Make one line with error bars for each diagnoser that occurs in a table.
+
+        Args:
+            y: column with the value.
+            frame: the table.
+            **where: values of further columns that select the rows of the line.
+        """
         there = set(frame["diagnoser"])
         return tuple(
             Series(name, y, drawn, {"diagnoser": name, **where}, "low", "high")
@@ -76,11 +89,11 @@ class Shown:
         )
 
     def still(self, name: str, shows: str) -> Static | None:
-        """A figure as it is printed; None where there was nothing to draw.
+        """Return the printed version of a figure, or None if the figure was not drawn.
 
         Args:
-            name: of the figure.
-            shows: what, for those who do not see it.
+            name: name of the figure.
+            shows: text alternative for readers who cannot see the figure.
         """
         picture = self.pictures.get(name)
         return None if picture is None else Static(picture.svg, picture.pdf, shows, name)

@@ -1,4 +1,4 @@
-"""What there really is in a question."""
+"""True system of a case."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 Effects = Mapping[str, Sequence[float]]
-"""Coefficients by name."""
+"""Coefficients of effects, by the name of the effect."""
 
 
 @dataclass(frozen=True)
 class World:
-    """What there really is.
+    """True system of a case, with hidden causes.
 
     Attributes:
-        system: its name.
-        parameters, constants: numbers by name.
+        system: name of the system.
+        parameters: values of the base parameters, by name.
+        constants: values of the constants, by name.
         effects: coefficients of effects of the library, in the order in which a signal passes them.
-        foreign: numbers of causes that the library does not have.
+        foreign: numbers of causes that the library does not contain.
     """
 
     system: str

@@ -1,4 +1,4 @@
-"""The ball with anything acting on it, for scipy: flights from impact to impact."""
+"""Reference simulation of the ball with scipy, with any effect, from impact to impact."""
 
 from __future__ import annotations
 
@@ -13,14 +13,19 @@ from bench.diagnosis.worlds.base import World
 from bench.diagnosis.worlds.joints import TOLERANCES, inside
 from sims.base import Array, Scenario
 
-AT_REST = 1e-5  # m/s: slower rebounds are none
+AT_REST = 1e-5  # m/s: after slower rebounds the ball rests
 FOREIGN = ("updraft", "gust", "wear", "layer")
 Acceleration = tuple[float, float, float]
 STATES = ("x", "y", "z", "vx", "vy", "vz")
 
 
 class Air:
-    """Everything that accelerates a ball in flight."""
+    """Accelerations of a ball in flight.
+
+    Args:
+        world: the true system.
+        number: index of the run in the recording.
+    """
 
     def __init__(self, world: World, number: int) -> None:
         self.g, self.acting = world.constants["gravity"], {**world.effects, **world.foreign}
@@ -32,8 +37,12 @@ class Air:
         self.breaks = list(self.gust[2:]) if self.gust else []
 
     def at(self, t: float, y: Any, middle: float) -> Acceleration:
-        """Acceleration in state y; `middle` is an instant within the stretch between two breaks
-        that is integrated.
+        """Compute the acceleration.
+
+        Args:
+            t: time.
+            y: position and velocity, (6,).
+            middle: a time within the integrated interval, which decides whether a gust acts.
         """
         ax, ay, az = 0.0, 0.0, -self.g
         for law, c in self.laws:
@@ -97,13 +106,23 @@ LAWS: dict[str, Callable[..., Acceleration]] = {
         0.0,
         0.0,
         c[0] * inside(x, c[1], c[2]),
-    ),  # foreign: air that rises over a place
-    "layer": _layer,  # foreign: drag above a height only
+    ),  # unmodelled: rising air within a region of x
+    "layer": _layer,  # unmodelled: quadratic drag above a height
 }
 
 
 def move(world: World, scenario: Scenario, number: int, instants: Array) -> Array:
-    """Positions and velocities (T, 6) of run `number` at increasing instants (T,) >= 0."""
+    """Simulate a run.
+
+    Args:
+        world: the true system.
+        scenario: the run.
+        number: index of the run in the recording.
+        instants: increasing times >= 0, (T,).
+
+    Returns:
+        Positions and velocities, (T, 6).
+    """
     air, until = Air(world, number), float(instants[-1])
     state = np.array([scenario.initial[name] for name in STATES])
     out = np.empty((instants.size, 6))
@@ -112,9 +131,7 @@ def move(world: World, scenario: Scenario, number: int, instants: Array) -> Arra
     while now < until:
         end = min([until, *(b for b in air.breaks if b > now)], default=until)
         looks = not (rising or resting)
-        if (
-            rising
-        ):  # the rise after a bounce is integrated without looking for the ground, where it begins
+        if rising:  # the ground, where the rise after a bounce begins, is no event
             end = min(end, now + rising)
         solved = _fly(air, now, end, state, world.constants["radius"] if looks else None, resting)
         reached, state = float(solved.t[-1]), solved.y[:, -1].copy()
@@ -154,11 +171,11 @@ def _fly(air: Air, now: float, end: float, state: Array, floor: float | None, re
 
 
 def _bounce(world: World, t: float, state: Array) -> tuple[Array, bool]:
-    """The state after an impact, and whether the ball stays down."""
+    """Compute the state after an impact, and whether the ball stays at rest."""
     speed, e = -state[5], world.parameters["restitution"]
     if "restitution.speed" in world.effects:
         e = min(e * speed ** world.effects["restitution.speed"][0], 1.0)
-    if "wear" in world.foreign:  # foreign: restitution that fades with time
+    if "wear" in world.foreign:  # unmodelled: restitution that decreases with time
         e = min(max(e * (1.0 - world.foreign["wear"][0] * t), 0.0), 1.0)
     along = hypot(state[3], state[4])
     lost = world.effects.get("contact.friction", [0.0])[0] * (1 + e) * speed

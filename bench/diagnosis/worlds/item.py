@@ -1,4 +1,4 @@
-"""One question: a recipe for a recording in which a cause is hidden, and its truth."""
+"""Benchmark case: recipe of a recording with a hidden cause, and its truth."""
 
 from __future__ import annotations
 
@@ -9,31 +9,35 @@ from typing import Any
 from bench.diagnosis.worlds.settings import ANY, Circumstances
 
 KINDS = ("clean", "single", "double", "foreign")
-"""Nothing is hidden, an effect, two, or a cause that the library does not have."""
+"""Kinds of cases: nothing hidden, one effect, two effects, or a cause outside the library."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """One question.
+    """Benchmark case.
 
     Attributes:
-        name: says kind, system, what was asked for, and seed.
-        system, kind: see `bench.diagnosis.worlds.questions.SYSTEMS`, and `KINDS`.
-        effects: coefficients of what is hidden, by name; of a foreign cause its own numbers.
-        size: RMS of the gap that base parameters and initial states, refitted, leave in the runs
-            for fitting, in units of the noise; of two effects that of each by itself.
+        name: composed of kind, system, requested values and seed.
+        system: one of `bench.diagnosis.worlds.questions.SYSTEMS`.
+        kind: one of `KINDS`.
+        effects: coefficients of the hidden effects, by name; for an unmodelled cause, its own
+            numbers.
+        size: RMS of the residual in the runs for fitting after base parameters and initial states
+            are refitted, in units of the noise; for two effects, that of each alone.
         noise: white, ar1 or quantised.
         stated: whether the recording states the noise.
-        rate, seconds, runs: sampling in Hz, a run's length, how many.
-        source: who made it: scipy, mujoco, or own equations.
+        rate: sampling rate, Hz.
+        seconds: length of a run.
+        runs: number of runs.
+        source: how the recording is simulated: scipy, mujoco or own equations.
         driven: whether there is an input.
-        channels: what is recorded.
-        seed: what it was drawn from.
-        parameters: the base parameters.
-        beyond: what is left of the gap, in units of the noise, with the best other answer: of a
-            foreign cause the best effect of the library, of two effects one of them, of an effect
-            that has a simpler form that.
-        asked: circumstances that were asked for.
+        channels: recorded channels.
+        seed: seed from which the case was drawn.
+        parameters: true base parameters.
+        beyond: RMS residual, in units of the noise, that the best wrong answer leaves: for an
+            unmodelled cause the best effect of the library, for two effects one of them, for an
+            effect with a simpler form that form.
+        asked: recording conditions that were specified and not drawn.
     """
 
     name: str
@@ -55,12 +59,12 @@ class Item:
     asked: Circumstances = ANY
 
     def json(self) -> dict[str, Any]:
-        """As plain values."""
+        """Convert to plain values for JSON."""
         return asdict(self)
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Item:
-        """An item from its JSON."""
+        """Restore a case from its JSON document."""
         effects = {name: tuple(c) for name, c in document["effects"].items()}
         given = {**document, "effects": effects, "channels": tuple(document["channels"])}
         return cls(**{**given, "asked": Circumstances(*document.get("asked", ()))})

@@ -1,8 +1,8 @@
-"""Questions: recordings of independent simulators in which a cause is hidden, drawn from
-a seed.
+"""Sampling of cases for ball, pendulum and slider.
 
-`draw` chooses what is hidden and how strongly, `realise` writes the recording and, apart from it,
-the truth. Whatever is drawn follows from the item's name; an item is a recipe, no data.
+`draw` chooses what is hidden and how strongly. `realise` writes the recording and, in a separate
+file, the truth. Everything that is drawn follows from the name of the case; a case is a recipe
+without data.
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ from sims.recording.recording import Recording, Run
 from sims.recording.write import write_recording
 
 SYSTEMS = ("ball", "pendulum", "slider")
-SMALL = (0.1, 0.2, 0.3, 0.5)  # sizes asked for the power curve only
+SMALL = (0.1, 0.2, 0.3, 0.5)  # sizes for the power curve only
 
-# Noises that must be left when only one of two effects, or no foreign cause, is in the model.
+# Minimum RMS residual, in units of the noise, if only one of two effects or no unmodelled cause is
+# in the model.
 APART = 1.0
-# Noises that the simpler form of an effect must leave, or else it is the right answer.
+# Minimum RMS residual, in units of the noise, with the simpler form of an effect; below it, the
+# simpler form is a correct answer.
 TELLING = 0.4
 SIMPLER = {
     "friction.direction": ("drag.linear",),
@@ -45,27 +47,35 @@ SIMPLER = {
         "drag.quadratic",
         "force.bias",
         "gravity.tilt",
-    ),  # air that moves fast is a steady push
+    ),  # fast air is a steady push
 }
 
 EQUIVALENT: tuple[tuple[str, bool, frozenset[str]], ...] = (
     ("slider", True, frozenset({"gravity.tilt", "force.bias", "input.bias"})),
     ("pendulum", True, frozenset({"force.bias", "input.bias"})),
-    ("pendulum", True, frozenset({"input.gain", "gravity.scale"})),  # the inertia takes up the rest
+    ("pendulum", True, frozenset({"input.gain", "gravity.scale"})),  # the inertia absorbs the rest
     ("pendulum", False, frozenset({"force.bias", "input.bias"})),
-    ("pendulum", False, frozenset({"gravity.tilt", "sensor.bias"})),  # gravity turned and scaled
+    ("pendulum", False, frozenset({"gravity.tilt", "sensor.bias"})),  # gravity rotated and scaled
     (
         "ball",
         False,
         frozenset({"force.bias", "gravity.scale", "clock.skew"}),
-    ),  # for no accelerometer is recorded
+    ),  # no accelerometer is recorded
 )
-"""Effects of a system, with an input or without, that give the same motion for some parameters and
-initial states: exactly, whatever the data."""
+"""Effects that are exactly equivalent: they give the same motion for some parameters.
+
+Each entry is a system, whether it has an input, and the effects. The initial states may differ too.
+"""
 
 
 def same_class(system: str, driven: bool, effect: str) -> frozenset[str]:
-    """The effect and all that are equivalent to it."""
+    """Return an effect and all effects that are equivalent to it.
+
+    Args:
+        system: name of the system.
+        driven: whether there is an input.
+        effect: name of the effect.
+    """
     classes = (
         names for *where, names in EQUIVALENT if where == [system, driven] and effect in names
     )
@@ -80,16 +90,19 @@ def draw(
     size: float | None = None,
     wanted_so: Circumstances = ANY,
 ) -> Item | None:
-    """An item, or None where the drawn sensors cannot show the effect at the drawn size (within
-    `shapes.LARGEST`).
+    """Draw a case.
 
     Args:
         kind: clean, single, double or foreign.
         system: ball, pendulum or slider.
-        seed: everything else follows from it.
-        effect: what to hide (of two, the first); drawn where it is not given.
-        size: the wanted size; drawn where it is not given.
-        wanted_so: circumstances that are not to be drawn.
+        seed: seed from which everything else follows.
+        effect: hidden effect (the first one of a double case); None to draw it.
+        size: size in units of the noise; None to draw it.
+        wanted_so: recording conditions that are not drawn.
+
+    Returns:
+        The case, or None if the sensors cannot show the effect at this size with a strength up to
+        `shapes.LARGEST`, or if another answer explains it too well.
     """
     asked = effect or "any"
     name = "-".join(
@@ -115,7 +128,8 @@ def draw(
     wanted = size or float(
         np.exp(rng.uniform(np.log(3.0 if kind in ("double", "foreign") else 1.0), np.log(10.0)))
     )
-    # What is hidden must show in the runs for fitting: nobody could learn it from those held out.
+    # The effect must be observable in the runs for fitting, because the held-out runs are not
+    # fitted.
     shown = replace(setting, scenarios=setting.scenarios[: item.runs - held_out_of(item)])
     return {"clean": _clean, "single": _single, "double": _double, "foreign": _foreign}[kind](
         item, shown, hidden, wanted, rng
@@ -123,7 +137,7 @@ def draw(
 
 
 def held_out_of(item: Item) -> int:
-    """How many of the last runs are marked held_out."""
+    """Return the number of held-out runs; they are the last runs of the recording."""
     return max(1, item.runs // 3)
 
 
@@ -139,7 +153,7 @@ def _setting(
 
 
 def setting_of(item: Item) -> Setting:
-    """The circumstances in which an item was drawn."""
+    """Restore the recording conditions of a case."""
     return _setting(item.name, item.system, tuple(item.effects), item.asked)
 
 
@@ -185,7 +199,17 @@ def _single(
 def coefficients(
     name: str, setting: Setting, wanted: float, rng: np.random.Generator
 ) -> tuple[float, ...] | None:
-    """Coefficients of one effect at which the gap has the wanted size; None if there are none."""
+    """Find coefficients of an effect at which the residual has the requested size.
+
+    Args:
+        name: name of the effect.
+        setting: recording conditions.
+        wanted: size in units of the noise.
+        rng: random generator for the shape of the effect.
+
+    Returns:
+        Coefficients, or None if there are none.
+    """
     of = shapes.shape(name, setting, rng)
     left = sizing.gap(
         setting, lambda strength: sizing.observed_by_batch(setting, {name: of(strength)})
@@ -197,8 +221,9 @@ def coefficients(
 def _double(
     item: Item, setting: Setting, hidden: tuple[str, ...], wanted: float, rng: np.random.Generator
 ) -> Item | None:
-    """Two effects, each of the wanted size alone; neither may look like a stronger form of the
-    other.
+    """Hide two effects, each of the requested size alone.
+
+    The case is rejected if one of them explains both.
     """
     found = {name: coefficients(name, setting, wanted, rng) for name in hidden}
     effects = _in_order({name: c for name, c in found.items() if c is not None})
@@ -212,14 +237,14 @@ def _double(
 
 
 def _in_order(effects: dict[str, tuple[float, ...]]) -> dict[str, tuple[float, ...]]:
-    """A lag of the input comes last: what is not linear acts on what is commanded."""
+    """Put a lag of the input last: nonlinear input effects act on the command."""
     return dict(sorted(effects.items(), key=lambda pair: pair[0] == "input.lag"))
 
 
 def _foreign(
     item: Item, setting: Setting, hidden: tuple[str, ...], wanted: float, rng: np.random.Generator
 ) -> Item | None:
-    """A cause that the library does not have, and of which it explains only a part."""
+    """Hide an unmodelled cause, which the library explains only in part."""
     (name,) = hidden
     of = shapes.foreign(name, setting, rng)
 
@@ -238,8 +263,15 @@ def _foreign(
 
 
 def realise(item: Item, folder: str | Path, truth: bool = True) -> Path:
-    """Write NAME.csv and NAME.toml, and beside them the truth as NAME.truth.json if wanted; the
-    path of the first.
+    """Write the recording of a case as NAME.csv and NAME.toml.
+
+    Args:
+        item: the case.
+        folder: folder for the files.
+        truth: whether to write NAME.truth.json too.
+
+    Returns:
+        Path of the CSV file.
     """
     setting = setting_of(item)
     runs = _runs(item, setting)

@@ -1,8 +1,10 @@
-"""Pendulum and slider with anything acting on them, for scipy: one coordinate, events where dry
-friction stops it; behind it what it drags along or remembers, which no sensor shows.
+"""Reference simulation of pendulum and slider with scipy, with any effect or unmodelled cause.
 
-Every law is written out here once more, in plain numbers; nothing is shared with the library that
-the exam is about.
+The model has one coordinate, and events where dry friction stops it. Hidden-state effects add a
+driven mass or an internal state that no sensor shows.
+
+Every law is written here again in plain numbers. Nothing is shared with the effect library, which
+the benchmark tests.
 """
 
 from __future__ import annotations
@@ -22,11 +24,12 @@ from bench.diagnosis.worlds.base import Effects, World
 from sims.base import Array, Scenario
 
 TOLERANCES: dict[str, Any] = {"rtol": 1e-8, "atol": 1e-10}
-SHORT = 0.011  # seconds: up to here a method of fifth order is cheaper than one of eighth
-# Share of its half width over which a region's borders are soft: the solver keeps its order.
+SHORT = 0.011  # seconds: for shorter intervals, order 5 is cheaper than order 8
+# Width of a region's soft border as a fraction of its half width; a smooth border preserves the
+# order of the solver.
 EDGE = 0.05
-SLEWED = 2e-3  # seconds in which an input that rises steadily is held
-STRAIGHT = 10  # parts of an interval in which a command that goes straight is held
+SLEWED = 2e-3  # seconds for which an input with limited rate is held constant
+STRAIGHT = 10  # number of parts of an interval in which a linear command is held constant
 
 NOT_LINEAR = ("input.deadband", "input.saturation", "backlash", "input.rate", "input.power")
 
@@ -37,8 +40,9 @@ Moved = tuple[float, Array, Any]
 
 @dataclass(frozen=True)
 class Piece:
-    """A stretch of time in which the felt input approaches `target` from `start`, at once where
-    `lag` is zero.
+    """Time interval in which the applied input approaches `target` from `start`.
+
+    With `lag` zero, the input jumps to `target` at once.
     """
 
     begin: float
@@ -48,19 +52,28 @@ class Piece:
     lag: float
 
     def at(self, t: float) -> float:
-        """The felt input at an instant of it."""
+        """Return the applied input at time t."""
         return self.target + (
             (self.start - self.target) * exp((self.begin - t) / self.lag) if self.lag > 0 else 0.0
         )
 
     def cut(self, begin: float, end: float) -> Piece:
-        """A part of it."""
+        """Return the part of this interval from `begin` to `end`."""
         return Piece(begin, end, self.at(begin), self.target, self.lag)
 
 
 def felt(scenario: Scenario, effects: Effects, until: float) -> list[Piece]:
-    """The first input as the plant feels it, from 0 to `until`; a lag comes behind whatever is not
-    linear.
+    """Compute the first input as applied to the plant, from time 0 to `until`.
+
+    A lag must follow the nonlinear input effects.
+
+    Args:
+        scenario: the run.
+        effects: the hidden effects.
+        until: end time.
+
+    Raises:
+        NotImplementedError: a nonlinear input effect follows a lag.
     """
     if "u" not in scenario.inputs:
         return [Piece(0.0, until, 0.0, effects.get("input.bias", [0.0])[0], 0.0)]
@@ -91,7 +104,16 @@ def felt(scenario: Scenario, effects: Effects, until: float) -> list[Piece]:
 
 
 def _straight(levels: Array, edges: Array, share: float) -> tuple[Array, Array]:
-    """Levels in so many parts of each interval that they go straight, as far as `share` says."""
+    """Divide each interval into parts, to approximate an input between hold and linear.
+
+    Args:
+        levels: input at each sample.
+        edges: time of each sample.
+        share: 0 for a zero-order hold, 1 for linear interpolation.
+
+    Returns:
+        Levels and begins of the parts.
+    """
     parts = (np.arange(STRAIGHT) + 0.5) / STRAIGHT
     fine = levels[:-1, None] + share * np.diff(levels)[:, None] * parts
     begins = edges[:-1, None] + np.diff(edges)[:, None] * np.arange(STRAIGHT) / STRAIGHT
@@ -99,7 +121,11 @@ def _straight(levels: Array, edges: Array, share: float) -> tuple[Array, Array]:
 
 
 def _slewed(levels: Array, edges: Array, most: float) -> tuple[Array, Array]:
-    """Levels in short parts of time that follow no faster than `most` a second."""
+    """Limit the rate of an input to `most` per second, in short parts of constant level.
+
+    Returns:
+        Levels and begins of the parts.
+    """
     ends = [*edges[1:].tolist(), edges[-1] + 1.0]
     values, begins, state = [], [], float(levels[0])
     for level, begin, end in zip(levels.tolist(), edges.tolist(), ends, strict=True):
@@ -108,7 +134,7 @@ def _slewed(levels: Array, edges: Array, most: float) -> tuple[Array, Array]:
             away = level - state
             lasting = min(abs(away) / most, last - begin)
             after = level if lasting >= abs(away) / most else state + copysign(most * lasting, away)
-            # the mean over the part, whose rise may end within it
+            # mean over the part, in which the rise may end
             values.append(0.5 * (state + after) * lasting / (last - begin))
             values[-1] += after * (1 - lasting / (last - begin))
             begins.append(begin)
@@ -139,8 +165,14 @@ STEPWISE: dict[str, Callable[..., Array]] = {
 
 
 class Joint:
-    """One coordinate: generalised `inertia`, `weight` (its own force of position), laws that push,
-    laws that rub.
+    """Equation of motion of one coordinate with effects and unmodelled causes.
+
+    Attributes:
+        inertia: generalised inertia of the drive side.
+        weight: gravity force as a function of position.
+        forces: laws of the acting forces.
+        limits: laws of the dry friction limits.
+        behind: hidden-state effects: driven loads and hysteresis.
     """
 
     def __init__(self, world: World, number: int) -> None:
@@ -177,11 +209,18 @@ class Joint:
         self.inertia = whole - sum(part.inertia for part in self.behind)
 
     def enter(self, piece: Piece) -> None:
-        """Take up a stretch of the input."""
+        """Set the input interval in which the motion is integrated."""
         self.piece, self.middle = piece, 0.5 * (piece.begin + piece.end)
 
     def pull(self, t: float, x: float, v: float, *z: float) -> float:
-        """All but dry friction; z is the state of what is behind."""
+        """Compute the force on the coordinate, without dry friction.
+
+        Args:
+            t: time.
+            x: position.
+            v: velocity.
+            *z: states of the hidden-state effects.
+        """
         total = self.piece.at(t) + self.weight(x)
         for force in self.forces:
             total += force(t, x, v)
@@ -190,22 +229,37 @@ class Joint:
         return total
 
     def rates(self, x: float, v: float, *z: float) -> list[float]:
-        """Of the state of what is behind."""
+        """Compute the time derivatives of the states of the hidden-state effects.
+
+        Args:
+            x: position.
+            v: velocity.
+            *z: states of the hidden-state effects.
+        """
         parts = zip(self.behind, batched(z), strict=True)
         return [rate for part, own in parts for rate in part.rates(x, v, *own)]
 
     def limit(self, t: float, x: float, v: float) -> float:
-        """The largest dry friction."""
+        """Compute the dry friction limit.
+
+        Args:
+            t: time.
+            x: position.
+            v: velocity.
+        """
         return sum(limit(t, x, v) for limit in self.limits)
 
 
 def batched(z: Sequence[float]) -> list[tuple[float, float]]:
-    """In pairs."""
+    """Group values in pairs."""
     return list(zip(z[::2], z[1::2], strict=True))
 
 
 class Load(ABC):
-    """A mass behind the one that the sensor shows: `share` of the inertia and of the weight."""
+    """Load behind a transmission: `share` of the inertia and of the weight.
+
+    The sensor shows the motion of the drive side, x and v; the load has the states y and w.
+    """
 
     def __init__(self, inertia: float, weight: Weight, share: float) -> None:
         self.whole, self.inertia, self.weight = inertia, share * inertia, weight
@@ -213,19 +267,40 @@ class Load(ABC):
 
     @abstractmethod
     def between(self, x: float, v: float, y: float, w: float) -> float:
-        """Acceleration of the load by the first mass."""
+        """Compute the acceleration of the load by the drive side.
+
+        Args:
+            x: position of the drive side.
+            v: velocity of the drive side.
+            y: position of the load.
+            w: velocity of the load.
+        """
 
     def force(self, x: float, v: float, y: float, w: float) -> float:
-        """On the first mass."""
+        """Compute the force of the load on the drive side.
+
+        Args:
+            x: position of the drive side.
+            v: velocity of the drive side.
+            y: position of the load.
+            w: velocity of the load.
+        """
         return -self.inertia * self.between(x, v, y, w) - self.share * self.weight(x)
 
     def rates(self, x: float, v: float, y: float, w: float) -> tuple[float, float]:
-        """Of its own state."""
+        """Compute the time derivatives of the load's states.
+
+        Args:
+            x: position of the drive side.
+            v: velocity of the drive side.
+            y: position of the load.
+            w: velocity of the load.
+        """
         return w, self.between(x, v, y, w) + self.weight(y) / self.whole
 
 
 class Sprung(Load):
-    """On a spring that swings with `frequency` rad/s where the first mass is held."""
+    """Load on a spring, with `frequency` rad/s when the drive side is fixed."""
 
     def __init__(
         self, inertia: float, weight: Weight, share: float, frequency: float, ratio: float
@@ -234,27 +309,27 @@ class Sprung(Load):
         self.frequency, self.ratio = frequency, ratio
 
     def begin(self, x: float, v: float) -> tuple[float, float]:
-        """Its own state to begin with."""
+        """Return the initial state of the load, with the static deflection of the spring."""
         return x + self.weight(x) / self.whole / self.frequency**2, v
 
     def between(self, x: float, v: float, y: float, w: float) -> float:
-        """See `Load`."""
+        """Compute the acceleration of the load by spring and damper; see `Load`."""
         return self.frequency**2 * (x - y) + 2 * self.ratio * self.frequency * (v - w)
 
 
 class Loose(Load):
-    """Behind a gap with flanks that take every knock and never pull."""
+    """Load behind backlash, with stiff damped flanks that never pull."""
 
     def __init__(self, inertia: float, weight: Weight, gap: float, share: float) -> None:
         super().__init__(inertia, weight, share)
         self.gap = gap
 
     def begin(self, x: float, v: float) -> tuple[float, float]:
-        """Its own state to begin with."""
+        """Return the initial state of the load, centred in the gap."""
         return x, v
 
     def between(self, x: float, v: float, y: float, w: float) -> float:
-        """See `Load`."""
+        """Compute the acceleration of the load by the flank in contact; see `Load`."""
         over = abs(x - y) - self.gap / 2
         if over <= 0:
             return 0.0
@@ -265,7 +340,7 @@ class Loose(Load):
 
 
 class Yielding:
-    """Dry friction whose surfaces give way over `deflection` first; its state is a share of it."""
+    """Dahl friction: the surfaces yield over `deflection`; its state is a fraction of the limit."""
 
     inertia = 0.0
 
@@ -273,15 +348,27 @@ class Yielding:
         self.most, self.deflection = limit, deflection
 
     def begin(self, x: float, v: float) -> tuple[float, float]:
-        """Its own state to begin with."""
+        """Return the initial state, without strain."""
         return 0.0, 0.0
 
     def force(self, x: float, v: float, _: float, strain: float) -> float:
-        """On the mass."""
+        """Compute the friction force on the mass.
+
+        Args:
+            x: position.
+            v: velocity.
+            strain: friction force as a fraction of its limit.
+        """
         return -self.most * strain
 
     def rates(self, x: float, v: float, _: float, strain: float) -> tuple[float, float]:
-        """Of its own state."""
+        """Compute the time derivatives of the two states.
+
+        Args:
+            x: position.
+            v: velocity.
+            strain: friction force as a fraction of its limit.
+        """
         speed = min(abs(v) / self.deflection, 400.0)
         return 0.0, speed * (copysign(1.0, v) - strain)
 
@@ -313,11 +400,11 @@ FORCES: dict[str, Callable[[Joint, list[float]], Law]] = {
     "force.bias": lambda j, c: lambda t, x, v: c[0],
     "force.ripple": lambda j, c: lambda t, x, v: _wave(c, x / c[2]),
     "force.periodic": lambda j, c: lambda t, x, v: _wave(c, t * c[2]),
-    "ageing": lambda j, c: lambda t, x, v: -c[0] * t * v,  # foreign: damping that grows with time
+    "ageing": lambda j, c: lambda t, x, v: -c[0] * t * v,  # unmodelled: damping grows with time
     "state.limit": lambda j, c: lambda t, x, v: -copysign(1.0, c[0]) * stopped(x, v, *c),
     "latch": lambda j, c: (
         lambda t, x, v: -c[0] * max(x - c[1], 0.0) if j.latched else 0.0
-    ),  # foreign: a soft stop that is there in every other run
+    ),  # unmodelled: a soft end stop in every other run
 }
 LIMITS: dict[str, Callable[[Joint, list[float]], Law]] = {
     "friction.coulomb": lambda j, c: lambda t, x, v: c[0],
@@ -338,18 +425,27 @@ LIMITS: dict[str, Callable[[Joint, list[float]], Law]] = {
     "friction.warming": lambda j, c: lambda t, x, v: (c[0] + c[1] * abs(v)) * exp(-t / c[2]),
     "patch": lambda j, c: (
         lambda t, x, v: c[0] * inside(x, c[1], c[2])
-    ),  # foreign: rough from c1 - c2 to c1 + c2
+    ),  # unmodelled: dry friction from c1 - c2 to c1 + c2
 }
 FOREIGN = ("patch", "gust", "ageing", "latch")
 
 
 def through(drive: float, against: float) -> float:
-    """What gears transmit from one side to the other; nothing where both pull the same way."""
+    """Return the smaller force that gears transmit; zero if both forces have the same direction."""
     return min(abs(drive), abs(against)) if drive * against > 0 else 0.0
 
 
 def stopped(x: float, v: float, stiffness: float, place: float, loss: float) -> float:
-    """The force of an end stop away from it: Hertz's contact, stated at a depth of 0.01."""
+    """Compute the magnitude of the force of an end stop, by Hertz's contact law.
+
+    Args:
+        x: position.
+        v: velocity.
+        stiffness: force at a depth of 0.01, divided by that depth; its sign is the side of the
+            stop.
+        place: position of the stop.
+        loss: damping, as a factor of the approach velocity.
+    """
     side = copysign(1.0, stiffness)
     depth = max(side * (x - place), 0.0)
     push: float = depth**1.5
@@ -357,14 +453,32 @@ def stopped(x: float, v: float, stiffness: float, place: float, loss: float) -> 
 
 
 def inside(x: float, centre: float, half: float) -> float:
-    """1 inside a region, 0 outside, its borders soft; the integral over x is the region's width."""
+    """Return 1 inside a region and 0 outside, with soft borders.
+
+    The integral over x is the width of the region.
+
+    Args:
+        x: position.
+        centre: centre of the region.
+        half: half width of the region.
+    """
     return 0.5 * (
         tanh((x - centre + half) / (EDGE * half)) - tanh((x - centre - half) / (EDGE * half))
     )
 
 
 def move(world: World, scenario: Scenario, number: int, instants: Array) -> Array:
-    """Positions and velocities (T, 2) of run `number` at increasing instants (T,) >= 0."""
+    """Simulate a run.
+
+    Args:
+        world: the true system.
+        scenario: the run.
+        number: index of the run in the recording.
+        instants: increasing times >= 0, (T,).
+
+    Returns:
+        Positions and velocities, (T, 2).
+    """
     joint, until = Joint(world, number), float(instants[-1])
     names = ("q", "qd") if world.system == "pendulum" else ("x", "v")
     state = np.array([scenario.initial[name] for name in names])
@@ -385,7 +499,17 @@ def move(world: World, scenario: Scenario, number: int, instants: Array) -> Arra
 
 
 def _through(joint: Joint, state: Array, instants: Array, out: Array) -> Array:
-    """To the end of the joint's piece of input, standstill by standstill."""
+    """Integrate to the end of the input interval, from one standstill to the next.
+
+    Args:
+        joint: the equation of motion.
+        state: state at the begin of the interval.
+        instants: times of the samples, (T,).
+        out: receives positions and velocities, (T, 2).
+
+    Returns:
+        State at the end.
+    """
     now, end = joint.piece.begin, joint.piece.end
     for _ in range(10_000):
         if now >= end:
@@ -399,8 +523,10 @@ def _through(joint: Joint, state: Array, instants: Array, out: Array) -> Array:
 
 
 def _glide(joint: Joint, now: float, state: Array) -> Moved:
-    """Until the next standstill, breaking loose or the piece's end: when, the state there, the
-    motion (None: none).
+    """Integrate until the next standstill, break-away or end of the input interval.
+
+    Returns:
+        End time, state at that time, and the dense solution (None without motion).
     """
     (x, v, *z), end = state, joint.piece.end
     way = copysign(1.0, v) if v else 0.0
@@ -437,7 +563,7 @@ def _glide(joint: Joint, now: float, state: Array) -> Moved:
 
 
 def _held(joint: Joint, now: float, state: Array) -> Moved:
-    """Held by dry friction while what is behind moves on: until it breaks loose."""
+    """Integrate the hidden states while dry friction holds the coordinate, until it breaks away."""
     end = joint.piece.end
 
     def rate(t: float, y: Array) -> list[float]:
@@ -454,8 +580,10 @@ def _held(joint: Joint, now: float, state: Array) -> Moved:
 
 
 def _loose(joint: Joint, now: float, x: float) -> float:
-    """When what pulls exceeds friction, else the piece's end; within a piece only some forces
-    change by themselves.
+    """Find the time at which the coordinate breaks away, or the end of the input interval.
+
+    Within an input interval only time-dependent forces and limits change while the coordinate
+    rests.
     """
     end = joint.piece.end
     if not joint.restless:

@@ -1,6 +1,7 @@
-"""Every question that can be drawn, whatever it is about: ball, pendulum and slider by scipy and
-MuJoCo (`bench.diagnosis.worlds.items`), a servo and an arm of two joints by equations of their own
-(`bench.diagnosis.worlds.machines`).
+"""All cases that can be drawn, dispatched by system.
+
+Ball, pendulum and slider are simulated by scipy and MuJoCo (`bench.diagnosis.worlds.items`), a
+servo and a two-joint arm by their own equations of motion (`bench.diagnosis.worlds.machines`).
 """
 
 from __future__ import annotations
@@ -20,18 +21,18 @@ from sims import effects as library
 from sims.servo.simulator import Servo
 
 SYSTEMS = (*items.SYSTEMS, *machines.SYSTEMS)
-"""What can be asked about."""
+"""Names of all systems."""
 USUAL = items.SYSTEMS
-"""What is asked about where an experiment names no systems."""
+"""Systems that are used if an experiment does not name any."""
 
 
 class Texts(NamedTuple):
-    """A recording as texts of files.
+    """Recording as texts of files.
 
     Attributes:
-        table: CSV.
-        description: TOML.
-        beside: other files, by name.
+        table: CSV text.
+        description: TOML text.
+        beside: texts of other files, by file name.
     """
 
     table: str
@@ -47,34 +48,49 @@ def draw(
     size: float | None = None,
     asked: Circumstances = ANY,
 ) -> Item | None:
-    """An item, or None where what is recorded cannot show it; see
-    `bench.diagnosis.worlds.items.draw`.
+    """Draw a case; see `bench.diagnosis.worlds.items.draw`.
+
+    Args:
+        kind: one of `KINDS`.
+        system: one of `SYSTEMS`.
+        seed: seed of the case.
+        effect: hidden effect; None to draw it.
+        size: size in units of the noise; None to draw it.
+        asked: recording conditions that are not drawn.
+
+    Returns:
+        The case, or None if the hidden cause is not observable.
     """
     by = machines.draw if system in machines.SYSTEMS else items.draw
     return by(kind, system, seed, effect, size, asked)
 
 
 def hidden_in(system: str) -> list[str]:
-    """Effects of the library that can be hidden."""
+    """List the effects of the library that can be hidden in a system."""
     if system in machines.SYSTEMS:
         return list(causes.EFFECTS[system])
     return sorted(library.library(SIMULATORS[system].system))
 
 
 def foreign_to(system: str) -> list[str]:
-    """Causes that the library does not have."""
+    """List the causes for a system that the library does not contain."""
     return list(causes.FOREIGN if system in machines.SYSTEMS else FOREIGN[system])
 
 
 def same_class(item: Item, effect: str) -> frozenset[str]:
-    """The effect and all that are equivalent to it in an item's recording."""
+    """Return an effect and all effects that are equivalent to it in the recording of a case."""
     if item.system in machines.SYSTEMS:
         return machines.same_class(item.system, effect)
     return items.same_class(item.system, item.driven, effect)
 
 
 def coefficients_of(system: str, name: str) -> list[str]:
-    """Names of an effect's coefficients, in the order of an item's numbers."""
+    """List the names of an effect's coefficients, in the order of the numbers in a case.
+
+    Args:
+        system: name of the system.
+        name: name of the effect, with or without a place.
+    """
     effect = library.get(name.partition("@")[0])
     if system == "arm2":
         return [coefficient.name for coefficient in effect.coefficients]
@@ -83,7 +99,7 @@ def coefficients_of(system: str, name: str) -> list[str]:
 
 
 def texts_of(item: Item) -> Texts:
-    """The recording of an item."""
+    """Render the recording of a case as texts."""
     with tempfile.TemporaryDirectory() as folder:
         if item.system in machines.SYSTEMS:
             path = machines.written(item, Path(folder))

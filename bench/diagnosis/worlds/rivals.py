@@ -1,5 +1,7 @@
-"""What else would explain an observation: effects of the library refitted to it, the most promising
-ones.
+"""Competing effects: effects of the library refitted to the observations of a case.
+
+Cases that a competing effect explains too well are rejected as ambiguous. Only the most promising
+effects are refitted.
 """
 
 from __future__ import annotations
@@ -15,11 +17,11 @@ from bench.diagnosis.worlds.world import SIMULATORS
 from sims import effects as library
 from sims.base import Array
 
-PROMISING = 4  # effects that are refitted, of those that close most of the gap to first order
-STARTS = 3  # shapes from which one effect is refitted
+PROMISING = 4  # number of effects refitted, those with the smallest first-order residual
+STARTS = 3  # number of starting points from which one effect is refitted
 SHAPES: dict[
     str, list[tuple[float, ...]]
-] = {  # first guesses of what shapes an effect rather than scales it, in the library's units
+] = {  # initial guesses of shape parameters, in the units of the library
     "force.periodic": [(f,) for f in (0.2, 0.4, 0.7, 1.2, 2.0, 3.5)],
     "force.ripple": [(p,) for p in (0.1, 0.2, 0.4, 0.8, 1.6, 3.0, 6.0)],
     "friction.position": [(p,) for p in (0.3, 0.6, 1.2, 2.5, 5.0)],
@@ -33,11 +35,16 @@ SHAPES: dict[
 def left_with(
     setting: Setting, observed: Array, name: str, coefficients: Sequence[float] | None = None
 ) -> float:
-    """What base parameters, initial states and the effect of this name leave of observations (R, T,
-    C), refitted.
+    """Compute the residual after base parameters, initial states and an effect are refitted.
 
-    It starts from the truth: the setting's numbers and these coefficients, or from guesses where
-    none are given.
+    Args:
+        setting: recording conditions with the true parameters, where the fit starts.
+        observed: noise-free observations, (R, T, C).
+        name: name of the effect.
+        coefficients: starting values of its coefficients; None for several guesses.
+
+    Returns:
+        RMS residual in units of the noise.
     """
     fit = Fitter(setting, [name])
     if coefficients is not None:
@@ -47,7 +54,15 @@ def left_with(
 
 
 def best(setting: Setting, observed: Array) -> tuple[str, float]:
-    """The effect of the library that leaves least of observations (R, T, C), and how much."""
+    """Find the effect of the library that leaves the smallest residual.
+
+    Args:
+        setting: recording conditions.
+        observed: noise-free observations, (R, T, C).
+
+    Returns:
+        Name of the effect and RMS residual in units of the noise.
+    """
     bare = Fitter(setting)(observed)
     usable = library.library(SIMULATORS[setting.system].system)
     names = [n for n in usable if setting.driven or not (n.startswith("input.") or n == "backlash")]
@@ -59,17 +74,23 @@ def best(setting: Setting, observed: Array) -> tuple[str, float]:
 
 
 def _guesses(setting: Setting, observed: Array, name: str, bare: Fit) -> list[tuple[float, Array]]:
-    """(what would be left to first order, theta) for every shape, the best first; `bare` is the fit
-    without it.
+    """List starting points for refitting an effect, the best first.
+
+    Args:
+        setting: recording conditions.
+        observed: noise-free observations, (R, T, C).
+        name: name of the effect.
+        bare: fit without the effect.
+
+    Returns:
+        Pairs of RMS residual (to first order where that is possible) and theta.
     """
     fit = Fitter(setting, [name])
-    if (
-        name == "input.saturation"
-    ):  # it starts not at zero but at the peak, where its first order is none
+    if name == "input.saturation":  # starts below the peak: at the peak the derivative is zero
         peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
         guesses = [np.array([*bare.theta, share * peak]) for share in (0.9, 0.6)]
         result = [(_left_at(fit, observed, guess, bare), guess) for guess in guesses]
-    elif name == "state.limit":  # nor does a stop
+    elif name == "state.limit":  # an end stop that is not reached has no derivative either
         guesses = [np.array([*bare.theta, *stop]) for stop in _stops(setting, observed[..., 0])]
         result = [(_left_at(fit, observed, guess, bare), guess) for guess in guesses]
     else:
@@ -78,7 +99,7 @@ def _guesses(setting: Setting, observed: Array, name: str, bare: Fit) -> list[tu
 
 
 def _stops(setting: Setting, path: Array) -> Iterator[tuple[float, float, float]]:
-    """Soft and hard stops at either end of where it has been, met late and early."""
+    """Yield soft and hard end stops at either end of the travel, met late and early."""
     low, high = float(path.min()), float(path.max())
     far = 20.0 if setting.system == "pendulum" else 5000.0
     for share, part in product((0.03, 0.15), (0.001, 0.01, 0.1)):
@@ -95,8 +116,12 @@ def _left_at(fit: Fitter, observed: Array, theta: Array, bare: Fit) -> float:
 def _first_order(
     fit: Fitter, observed: Array, shape: Sequence[float], bare: Fit
 ) -> tuple[float, Array]:
-    """One step of least squares from the effect at zero, its shape held; numbers a system lacks are
-    left out.
+    """Estimate the residual by one least-squares step from a zero effect with a fixed shape.
+
+    Shape parameters that the system does not have are omitted.
+
+    Returns:
+        RMS residual of the linear model, and theta after the step.
     """
     base, count = bare.theta.size, fit.theta.size
     shape = shape[: count - base - 1]

@@ -1,5 +1,6 @@
-"""The circumstances of an exam's recordings: parameters, runs, inputs, channels and noise, all
-drawn from a seed.
+"""Recording conditions of a case, drawn from a seed.
+
+They are parameters, runs, inputs, channels and noise.
 """
 
 from __future__ import annotations
@@ -27,20 +28,26 @@ RANGES = {"ball": (2e-3, 2e-2), "pendulum": (1e-3, 1e-2), "slider": (1e-3, 1e-2)
 RATES = {
     "pendulum": (3.0, 10.0),
     "slider": (2.0, 5.0),
-}  # how much noisier the rate is than the position, 1/s
+}  # ratio of the noise of the rate to that of the position, 1/s
 PENDULUM = Pendulum(
     observe=["q"], engine="batch"
-)  # tells how far a drawn pendulum swings; gives no data
+)  # used to estimate the swing of a drawn pendulum; generates no data
 Drawn = tuple[dict[str, float], tuple[str, ...], list[Scenario]]
 MOST_RUNS = 6
 NOISES = ("white", "ar1", "quantised")
-BY_INPUT = ("input.", "backlash", "supply.", "friction.load_")  # shown by a drive alone
+BY_INPUT = ("input.", "backlash", "supply.", "friction.load_")  # effects that only an input shows
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Sensor noise: `sigma` by channel, its `kind`, the AR(1) coefficient, white noise in units of
-    a rounding step.
+    """Sensor noise.
+
+    Attributes:
+        sigma: standard deviation by channel.
+        kind: white, ar1 or quantised.
+        phi: AR(1) coefficient.
+        dither: standard deviation of the white noise before rounding, in units of a rounding step.
+        stated: whether the recording states the noise.
     """
 
     sigma: dict[str, float]
@@ -50,10 +57,15 @@ class Noise:
     stated: bool = True
 
     def added(self, observed: Array, rng: np.random.Generator) -> Array:
-        """Noiseless observations (T, C) as recorded."""
+        """Add noise to observations.
+
+        Args:
+            observed: noise-free observations, (T, C).
+            rng: random generator.
+        """
         sigma = np.array(list(self.sigma.values()))
         white = rng.standard_normal(observed.shape)
-        if self.kind == "quantised":  # rounding is good for step / sqrt(12)
+        if self.kind == "quantised":  # rounding has the standard deviation step / sqrt(12)
             step = sigma / np.sqrt(1 / 12 + self.dither**2)
             rounded: Array = np.round((observed + self.dither * step * white) / step) * step
             return rounded
@@ -66,7 +78,18 @@ class Noise:
 
 @dataclass(frozen=True)
 class Setting:
-    """All of a recording but what is hidden in it."""
+    """Recording conditions of a case, without the hidden cause.
+
+    Attributes:
+        system: name of the system.
+        parameters: true base parameters.
+        constants: constants of the system.
+        channels: names of the recorded channels.
+        scenarios: the runs.
+        noise: sensor noise.
+        rate: sampling rate, Hz.
+        seconds: length of a run.
+    """
 
     system: str
     parameters: dict[str, float]
@@ -79,7 +102,7 @@ class Setting:
 
     @property
     def sigma(self) -> Array:
-        """(C,) of the noise, by channel."""
+        """Standard deviation of the noise by channel, (C,)."""
         return np.array([self.noise.sigma[name] for name in self.channels])
 
     @property
@@ -88,16 +111,21 @@ class Setting:
         return bool(self.scenarios[0].inputs)
 
     def world(self, effects: Effects | None = None, foreign: Effects | None = None) -> World:
-        """With something hidden in it."""
+        """Make the true system with hidden causes.
+
+        Args:
+            effects: hidden effects of the library.
+            foreign: hidden unmodelled causes.
+        """
         return World(self.system, self.parameters, self.constants, effects or {}, foreign or {})
 
 
 class Circumstances(NamedTuple):
-    """What of a setting is asked for and not drawn; None is drawn.
+    """Requested recording conditions; those that are None are drawn.
 
     Attributes:
-        rate: samples a second.
-        runs: how many.
+        rate: sampling rate, Hz.
+        runs: number of runs.
         noise: one of `NOISES`.
     """
 
@@ -107,7 +135,7 @@ class Circumstances(NamedTuple):
 
 
 ANY = Circumstances()
-"""Everything is drawn."""
+"""Conditions of which all are drawn."""
 
 
 def setting(
@@ -117,11 +145,19 @@ def setting(
     short: bool = False,
     asked: Circumstances = ANY,
 ) -> Setting:
-    """A setting drawn with `rng`, in which the effects named in `hidden` have a chance to show."""
+    """Draw recording conditions in which the hidden effects can be observed.
+
+    Args:
+        system: name of the system.
+        rng: random generator.
+        hidden: names of the hidden effects.
+        short: whether there are always three runs.
+        asked: conditions that are not drawn.
+    """
     rate = int(rng.choice([50, 100, 200], p=[0.3, 0.5, 0.2]))
     seconds = float(rng.choice([2.0, 3.0, 4.0, 5.0, 6.0], p=[0.1, 0.2, 0.4, 0.2, 0.1]))
     runs = 3 if short else int(rng.choice([3, 4, 5, MOST_RUNS], p=[0.25, 0.4, 0.2, 0.15]))
-    # drawn all the same: what follows is drawn as it is without wishes
+    # These values are drawn in any case, so that later draws do not depend on the request.
     rate, runs = asked.rate or rate, asked.runs or runs
     times = np.arange(round(rate * seconds)) / rate
     draw = {"ball": _ball, "pendulum": _pendulum, "slider": _slider}[system]
@@ -176,7 +212,7 @@ def _pendulum(rng: np.random.Generator, times: Array, runs: int, hidden: Sequenc
         swing = PENDULUM.simulate(np.array([[parameters["inertia"]]]), scenario)
         if (
             0.25 < np.abs(swing).max() < 2.8
-        ):  # over the top, the smallest push decides which way it falls
+        ):  # beyond the top, the smallest force decides on which side it falls
             scenarios.append(scenario)
     return parameters, channels, scenarios
 
@@ -191,7 +227,7 @@ def _slider(rng: np.random.Generator, times: Array, runs: int, hidden: Sequence[
             "v": rng.choice([0.0, rng.uniform(-0.3, 0.3)]),
         }
         u = wave(form, times, rng, (0.3, 2.0))
-        u -= u.mean()  # or else it runs away
+        u -= u.mean()  # otherwise the slider drifts away
         travel = np.ptp(np.cumsum(np.cumsum(u))) * times[1] ** 2 / parameters["mass"]
         scenarios.append(
             Scenario(times, start, {"u": u * np.clip(rng.uniform(0.4, 2.5) / travel, 0.5, 8.0)})
@@ -200,8 +236,16 @@ def _slider(rng: np.random.Generator, times: Array, runs: int, hidden: Sequence[
 
 
 def wave(form: str, times: Array, rng: np.random.Generator, hertz: tuple[float, float]) -> Array:
-    """An input signal (T,) of amplitude one: steps between levels, a sine, or a chirp, within a
-    range of frequency.
+    """Generate an input signal of amplitude one.
+
+    Args:
+        form: steps (between random levels), sine or chirp.
+        times: sample times, (T,).
+        rng: random generator.
+        hertz: range of frequency, Hz.
+
+    Returns:
+        Signal, (T,).
     """
     if form == "steps":
         lasting = rng.uniform(0.25, 1.0)

@@ -1,8 +1,8 @@
-"""Coefficients of hidden causes: their shape is drawn, their strength s is left open, 1 being the
-far end of plausible.
+"""Coefficients of hidden causes as functions of a strength.
 
-`shape(name, setting, rng)` gives a function from strength to coefficients. Bounds are of the
-library's tables.
+The shape is drawn at random. The strength s remains free; 1 is the upper end of the plausible
+range. The bounds are those of the effect library. `shape(name, setting, rng)` returns the function
+from strength to coefficients.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sims import effects as library
 from sims.base import Array
 
 Shape = Callable[[float], tuple[float, ...]]
-"""From strength to coefficients."""
+"""Function from strength to coefficients."""
 SIGNED: tuple[str, ...] = (
     "force.bias",
     "gravity.scale",
@@ -29,11 +29,20 @@ SIGNED: tuple[str, ...] = (
     "sensor.drift",
 )
 SIGNED += ("clock.skew", "spring.cubic", "restitution.speed")
-LARGEST = 2.0  # beyond twice the plausible range nothing is asked
+LARGEST = 2.0  # maximum strength: twice the plausible range
 
 
 def shape(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
-    """The coefficients of an effect of the library by its strength."""
+    """Draw the shape of an effect of the library.
+
+    Args:
+        name: name of the effect.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Coefficients as a function of the strength.
+    """
     kind = SIMULATORS[setting.system].system.kind
     far = max(abs(bound) for bound in library.get(name).coefficients[0].range(kind))
     if name in SHAPES:
@@ -43,7 +52,7 @@ def shape(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
 
 
 def largest(name: str) -> float:
-    """The largest strength that is asked."""
+    """Return the maximum strength of an effect."""
     return {"input.saturation": 0.97, "input.hold": 1.0}.get(name, LARGEST)
 
 
@@ -54,7 +63,7 @@ def _direction(far: float, setting: Setting, rng: np.random.Generator, *behind: 
 
 
 def _level(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """Along x, and along y where there is one."""
+    """Draw a horizontal direction: along x, and along y if the system has it."""
     if setting.system == "ball":
         return _direction(far, setting, rng)
     sign = float(rng.choice([-1, 1]))
@@ -62,14 +71,14 @@ def _level(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
 
 
 def _ripple(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """A period that the motion passes several times."""
+    """Draw a ripple whose period the motion passes several times."""
     travel = np.median(_ranges(setting))
     period = min(travel / rng.uniform(2.0, 8.0), 1.0 if setting.system == "slider" else 6.28)
     return _direction(far, setting, rng, float(period))
 
 
 def _periodic(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """A few periods in a run at least."""
+    """Draw a periodic force with at least 1.5 periods in a run."""
     low, high = 1.5 / setting.seconds, 4.0
     return _direction(far, setting, rng, float(np.exp(rng.uniform(np.log(low), np.log(high)))))
 
@@ -83,46 +92,46 @@ def _wind(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
 
 
 def _stribeck(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """An extra larger than the rest, at speeds that the motion has for a good while."""
+    """Draw Stribeck friction with a large static part, at speeds that often occur in the motion."""
     extra, typical = rng.uniform(2.0, 6.0), np.median(np.abs(_speeds(setting)))
     speed = float(np.clip(typical * rng.uniform(0.15, 0.5), 0.02, 2.0))
     return lambda s: (far * s, extra * far * s, speed)
 
 
 def _saturation(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """A limit below the input's peak: at strength 0 at the peak, at 1 at nothing."""
+    """Return an input limit: at strength 0 the peak of the input, at strength 1 zero."""
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     return lambda s: (float(peak * (1 - s)),)
 
 
 def _one_way(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """Several times as much one way as the other."""
+    """Draw friction that is several times larger in one direction."""
     shares = [1.0, float(rng.uniform(0.0, 0.3))]
     rng.shuffle(shares)
     return lambda s: (far * shares[0] * s, far * shares[1] * s)
 
 
 def _power(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """Up to the square and beyond; at the input's peak it does what the input alone would."""
+    """Return a power law of the input that keeps the peak of the input unchanged."""
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     return lambda s: (float(peak**-s - 1), s)
 
 
 def _rate(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """A jump of the input's peak takes from no time at all to most of a second."""
+    """Return a rate limit: a jump to the input's peak takes 0.8 s times the strength."""
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     return lambda s: (float(peak / (0.8 * s)),)
 
 
 def _quadratic(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """At the forces that act the square makes as much as the load itself, or more."""
+    """Draw friction whose quadratic part exceeds the linear one at the peak force."""
     peak = max(np.abs(s.inputs["u"]).max() for s in setting.scenarios)
     square = float(far * rng.uniform(2.0, 6.0) / peak)
     return lambda s: (0.5 * far * s, square * s)
 
 
 def _uneven(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """A wave of most of the mean, that the motion passes once to four times."""
+    """Draw position-dependent friction whose period the motion passes one to four times."""
     travel = float(np.median(_ranges(setting)))
     low, high = (0.2, 5.0) if setting.system == "slider" else (0.5, 6.2832)
     period = float(np.clip(travel / rng.uniform(1.0, 4.0), low, high))
@@ -132,20 +141,20 @@ def _uneven(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
 
 
 def _warming(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """It is gone by the end of a run, or half of it is; the rest is viscous."""
+    """Draw warm-up friction with a time constant of 0.2 to 0.8 run lengths, partly viscous."""
     time = float(setting.seconds * rng.uniform(0.2, 0.8))
     viscous = float(far * rng.uniform(0.0, 1.0) / np.median(np.abs(_speeds(setting))))
     return lambda s: (far * s, viscous * s, max(time, 0.5))
 
 
 def _slip(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """Once in every run, at an instant well within it."""
+    """Draw a sensor slip at a time well within each run."""
     sign, instant = float(rng.choice([-1, 1])), float(rng.uniform(0.15, 0.85) * setting.seconds)
     return lambda s: (sign * far * s, instant)
 
 
 def _flexibility(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """A load that swings from a few times a run to a fifth of the sampling rate."""
+    """Draw a flexible load: from four oscillations per run to a fifth of the sampling rate."""
     low, high = 2 * np.pi * 4 / setting.seconds, 2 * np.pi * min(0.2 * setting.rate, 40.0)
     frequency = float(np.exp(rng.uniform(np.log(low), np.log(high))))
     ratio = float(np.exp(rng.uniform(np.log(0.01), np.log(0.3))))
@@ -153,20 +162,20 @@ def _flexibility(far: float, setting: Setting, rng: np.random.Generator) -> Shap
 
 
 def _play(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """A gap that is a part of the way that it goes."""
+    """Draw backlash: at strength 1 the gap is 0.3 of the travel."""
     share, travel = float(rng.uniform(0.2, 0.8)), float(np.median(_ranges(setting)))
     return lambda s: (0.3 * travel * s, share)
 
 
 def _hysteresis(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """Surfaces that give way over a few hundredths of the way that it goes."""
+    """Draw hysteresis with a deflection of 0.02 to 0.2 of the travel."""
     travel = float(np.median(_ranges(setting)))
     deflection = float(travel * np.exp(rng.uniform(np.log(0.02), np.log(0.2))))
     return lambda s: (far * s, deflection)
 
 
 def _stop(far: float, setting: Setting, rng: np.random.Generator) -> Shape:
-    """At an end of where it would go, above or below."""
+    """Draw an end stop within the travel, near its upper or lower end."""
     side, within = float(rng.choice([-1, 1])), float(rng.uniform(0.05, 0.2))
     place = float(np.quantile(np.concatenate(_bare(setting)), 1 - within if side > 0 else within))
     loss = float(rng.uniform(0.0, 0.4)) / (5.0 if setting.system == "pendulum" else 1.0)
@@ -198,7 +207,7 @@ SHAPES: dict[str, Callable[..., Shape]] = {
 
 
 def _bare(setting: Setting) -> list[Array]:
-    """Noiseless motion of every run with nothing hidden, (T,) of the first channel."""
+    """Simulate the noise-free motion without hidden causes: the first channel (T,) of every run."""
     return list(observed_by_batch(setting, {})[:, :, 0])
 
 
@@ -211,17 +220,26 @@ def _speeds(setting: Setting) -> Array:
 
 
 def foreign(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
-    """The numbers of a foreign cause by its strength; see `tests.exam.worlds`."""
+    """Draw the shape of an unmodelled cause; see `bench.diagnosis.worlds.world`.
+
+    Args:
+        name: name of the cause.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Numbers of the cause as a function of the strength.
+    """
     return FOREIGN[(setting.system == "ball", name)](setting, rng)
 
 
 def _begins(setting: Setting, lasting: float, rng: np.random.Generator) -> list[float]:
-    """A beginning within each run, held-out ones too, not the same in any two."""
+    """Draw a start time for each run, held-out runs included."""
     return [float(rng.uniform(0.1, 0.9) * (setting.seconds - lasting)) for _ in range(MOST_RUNS)]
 
 
 def _patch(setting: Setting, rng: np.random.Generator) -> Shape:
-    """Somewhere well within where it moves; about as wide as a fifth of that."""
+    """Draw a region of dry friction, 0.14 to 0.3 of the central 80 % of positions wide."""
     low, high = np.quantile(np.concatenate(_bare(setting)), [0.1, 0.9])
     half = float((high - low) * rng.uniform(0.07, 0.15))
     centre = float(rng.uniform(low + half, high - half))
@@ -244,7 +262,7 @@ def _ageing(setting: Setting, rng: np.random.Generator) -> Shape:
 
 
 def _latch(setting: Setting, rng: np.random.Generator) -> Shape:
-    """In every other run; met by the motion in most, for a small part of the time."""
+    """Draw a soft stop in every other run, which the motion reaches for a short time."""
     place = float(np.quantile(np.concatenate(_bare(setting)), rng.uniform(0.7, 0.85)))
     far = 10.0 if setting.system == "pendulum" else 2000.0
     return lambda s: (far * s, place)
@@ -274,7 +292,7 @@ def _wear(setting: Setting, rng: np.random.Generator) -> Shape:
 
 
 def _layer(setting: Setting, rng: np.random.Generator) -> Shape:
-    """Above most of the bounces, below most of the drops."""
+    """Draw a height above most bounces and below most drops, from which drag acts."""
     height = float(min(s.initial["z"] for s in setting.scenarios) * rng.uniform(0.55, 0.8))
     return lambda s: (2.0 * s, height)
 

@@ -1,7 +1,8 @@
-"""How large a hidden effect has to be: the gap that it leaves once base parameters and initial
-states are refitted.
+"""Sizing of hidden effects: strength at which an effect leaves a residual of the requested size.
 
-Only here is the batch engine used, to choose sizes; the exam's data never come from it.
+The size is the RMS residual after base parameters and initial states are refitted. The batch engine
+is used here to choose sizes. Recordings of the benchmark come from other integrators, except for
+hidden-state effects (`bench.diagnosis.worlds.world.simulated`).
 """
 
 from __future__ import annotations
@@ -15,20 +16,20 @@ from bench.diagnosis.worlds.settings import Setting
 from bench.diagnosis.worlds.world import SIMULATORS, Effects
 from sims.base import Array
 
-ACCURATE = 0.03  # of the wanted size
-LEAP = 8.0  # strength grows by no more at once, so that the fit can follow
-NUDGE = 1e-5  # of a fitted number's scale, for its derivative
-ENDLESS = 1e30  # of the noise: the motion explodes
+ACCURATE = 0.03  # relative tolerance of the size
+LEAP = 8.0  # maximum factor of the strength per step, so that the fit can follow
+NUDGE = 1e-5  # finite-difference step, as a fraction of a parameter's scale
+ENDLESS = 1e30  # in units of the noise: larger values count as diverged
 
 
 @dataclass(frozen=True)
 class Fit:
-    """What is left of observations at the best fit.
+    """Result of a fit.
 
     Attributes:
-        left: root mean square over all samples and channels, in units of the noise.
-        theta: base parameters, then coefficients.
-        starts: initial states (R, S), as `Fitter` was given them at first.
+        left: RMS residual over all samples and channels, in units of the noise.
+        theta: base parameters, then coefficients of effects.
+        starts: initial states, (R, S).
     """
 
     left: float
@@ -37,8 +38,11 @@ class Fit:
 
 
 class Fitter:
-    """Least squares over base parameters, coefficients of `effects`, and the initial state of every
-    run.
+    """Damped least-squares fit of base parameters, effect coefficients and initial states.
+
+    Args:
+        setting: recording conditions with the true parameters and initial states.
+        effects: names of the effects whose coefficients are fitted.
     """
 
     def __init__(self, setting: Setting, effects: Sequence[str] = ()) -> None:
@@ -68,7 +72,14 @@ class Fitter:
         starts: Array | None = None,
         rounds: int = 12,
     ) -> Fit:
-        """Fit observations (R, T, C), from `theta` and `starts` (default: the setting's)."""
+        """Fit observations.
+
+        Args:
+            observed: observations, (R, T, C).
+            theta: starting values of parameters and coefficients; None for those of the conditions.
+            starts: starting values of the initial states, (R, S); None for those of the conditions.
+            rounds: maximum number of iterations.
+        """
         theta = self.theta if theta is None else np.asarray(theta, dtype=float)
         starts, damping = self.starts if starts is None else starts, 1e-6
         rest, slope = self.look(observed, theta, starts)
@@ -80,7 +91,7 @@ class Fitter:
             new = np.clip(theta + step[:count] * self.scales, self.low, self.high)
             begun = starts + step[count:].reshape(starts.shape)
             tried, steeper = self.look(observed, new, begun)
-            if not tried @ tried < rest @ rest:  # NaN is no improvement
+            if not tried @ tried < rest @ rest:  # a NaN is no improvement
                 damping *= 30.0
                 if damping > 1e3:
                     break
@@ -93,15 +104,32 @@ class Fitter:
 
     @staticmethod
     def step(rest: Array, slope: Array, damping: float) -> Array:
-        """The damped step (P,) of least squares, each number in its scale."""
+        """Solve the damped normal equations.
+
+        Args:
+            rest: residual, (N,).
+            slope: Jacobian in units of the scales, (N, P).
+            damping: damping factor of the diagonal.
+
+        Returns:
+            Step in units of the scales, (P,).
+        """
         gram = slope.T @ slope
         diagonal = np.diag(gram)
         gram = gram + np.diag(damping * diagonal + 1e-9 * diagonal.max())
         return np.asarray(np.linalg.solve(gram, slope.T @ rest), dtype=np.float64)
 
     def look(self, observed: Array, theta: Array, starts: Array) -> tuple[Array, Array]:
-        """What is left (N,), and how the simulation changes (N, P) with each fitted number in its
-        scale.
+        """Compute the residual and its Jacobian by finite differences.
+
+        Args:
+            observed: observations, (R, T, C).
+            theta: parameters and coefficients.
+            starts: initial states, (R, S).
+
+        Returns:
+            The residual (N,) in units of the noise, infinite if the simulation diverges, and the
+            Jacobian (N, P) of the simulation in units of the scales.
         """
         runs, states, count = len(starts), len(self.states), theta.size
         moved = 1 + count + states
@@ -128,7 +156,12 @@ class Fitter:
 
 
 def observed_by_batch(setting: Setting, effects: Effects) -> Array:
-    """Noiseless observations (R, T, C) with these effects."""
+    """Simulate noise-free observations (R, T, C) with given effects.
+
+    Args:
+        setting: recording conditions.
+        effects: coefficients by name of the effect.
+    """
     kind = SIMULATORS[setting.system]
     fixed = {name: list(c) for name, c in effects.items()}
     simulator = kind(setting.constants, setting.channels, engine="batch", fixed=fixed)
@@ -139,15 +172,21 @@ def observed_by_batch(setting: Setting, effects: Effects) -> Array:
 
 
 def gap(setting: Setting, observed: Callable[[float], Array]) -> Callable[[float], float]:
-    """The gap by strength: what base parameters and initial states leave of `observed(strength)`,
-    (R, T, C).
+    """Make the function that computes the size of a cause from its strength.
+
+    Args:
+        setting: recording conditions.
+        observed: noise-free observations (R, T, C) as a function of the strength.
+
+    Returns:
+        RMS residual after refitting, in units of the noise, as a function of the strength.
     """
     fit = Fitter(setting)
     last: list[tuple[float, Fit]] = []
 
     def left(strength: float) -> float:
         theta, starts = fit.theta, fit.starts
-        if last:  # they move about in proportion
+        if last:  # fitted parameters and states change about in proportion to the strength
             before, found = last[-1]
             share = strength / before
             theta = np.clip(theta + share * (found.theta - theta), fit.low, fit.high)
@@ -163,10 +202,18 @@ def gap(setting: Setting, observed: Callable[[float], Array]) -> Callable[[float
 def sized(
     left: Callable[[float], float], wanted: float, largest: float, first: float = 1e-3
 ) -> float | None:
-    """The strength at which `left(strength)`, which grows from zero, is `wanted`; None if it is not
-    below `largest`.
+    """Find the strength at which the size has the requested value.
 
-    Secants on logarithmic scales, within a bracket once there is one.
+    The method is the secant method on logarithmic scales, within a bracket as soon as there is one.
+
+    Args:
+        left: size as a function of the strength, increasing from zero.
+        wanted: requested size.
+        largest: maximum strength.
+        first: first strength to try.
+
+    Returns:
+        The strength, or None if it is not below `largest`.
     """
     low, high, strength = (0.0, 0.0), (np.inf, np.inf), first
     for _ in range(12):
@@ -177,14 +224,20 @@ def sized(
             if strength >= largest or now * (largest / strength) ** 2 < wanted:
                 return None
             low = strength, now
-        else:  # NaN and infinity too
+        else:  # also if it is NaN or infinite
             high = strength, now
         strength = float(min(_between(low, high, wanted), largest))
     return None
 
 
 def _between(low: tuple[float, float], high: tuple[float, float], wanted: float) -> float:
-    """The next strength to try, given (strength, left) on either side of what is wanted."""
+    """Return the next strength to try.
+
+    Args:
+        low: strength and size below the requested size.
+        high: strength and size above it.
+        wanted: requested size.
+    """
     if not low[0]:
         return (
             high[0] * min(max(wanted / high[1], 1e-2), 0.9) if np.isfinite(high[1]) else high[0] / 5

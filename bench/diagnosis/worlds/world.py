@@ -1,17 +1,16 @@
-"""Worlds of the questions: one run of ball, pendulum or slider with any effect of the library, or
-with a foreign cause.
+"""Noise-free reference recordings of ball, pendulum or slider, with effects or unmodelled causes.
 
-Solved with scipy, or simulated by MuJoCo; never by the engine that `explain` itself uses. What the
-numbers of an effect mean stands in sims/effects/README.md; the foreign causes are told here, where
-the library has nothing like them:
+They are solved with scipy or simulated by MuJoCo, not by the engine that `explain` uses (except
+`simulated` with hidden-state effects). sims/effects/README.md defines the coefficients of the
+effects. The unmodelled causes, which the library does not contain, are:
 
-| cause | numbers | it does |
+| cause | numbers | meaning |
 |---|---|---|
 | `patch` | friction, centre, half width | pendulum, slider: dry friction in a region of position |
-| `gust` | force, seconds, begin in run 0, in run 1, ... | pendulum, slider: a force for a while |
-| `gust` | along x, upward, seconds, begin in run 0, ... | ball: an acceleration for a while |
+| `gust` | force, seconds, begin in run 0, in run 1, ... | pendulum, slider: temporary force |
+| `gust` | along x, upward, seconds, begin in run 0, ... | ball: temporary acceleration |
 | `ageing` | growth | pendulum, slider: damping -c t v, which grows with time |
-| `latch` | stiffness, place | pendulum, slider: a spring beyond a place, in every other run |
+| `latch` | stiffness, place | pendulum, slider: spring beyond a place, in every other run |
 | `updraft` | acceleration, centre, half width | ball: upward within a region of x |
 | `wear` | rate | ball: restitution e0 (1 - c t) |
 | `layer` | drag, height | ball: quadratic drag above a height |
@@ -48,18 +47,31 @@ __all__ = [
 SIMULATORS: dict[str, type[Simulated]] = {"ball": Ball, "pendulum": Pendulum, "slider": Slider}
 FOREIGN = {"ball": flights.FOREIGN, "pendulum": joints.FOREIGN, "slider": joints.FOREIGN}
 CHANNELS = {"ball": ("x", "y", "z"), "pendulum": ("q", "qd"), "slider": ("x", "v")}
-FINE = 5e-4  # seconds: a lagging sensor is followed in steps no longer than this
+FINE = 5e-4  # seconds: maximum step in which a lagging sensor is integrated
 MUJOCO_STEP = 1e-3  # seconds: at MuJoCo's default step its error would be a tenth of the noise
 
 
 def constants_of(system: str, **changed: float) -> dict[str, float]:
-    """The system's constants by name, some changed."""
+    """Return the constants of a system by name.
+
+    Args:
+        system: name of the system.
+        **changed: constants with other values.
+    """
     return {c.name: c.value for c in SIMULATORS[system].constants} | changed
 
 
 def solved(world: World, scenario: Scenario, channels: Sequence[str], number: int = 0) -> Array:
-    """What noiseless sensors record of a run, (T, C), by scipy; `number` is the run's place in the
-    recording.
+    """Simulate a run with scipy and return noise-free sensor readings.
+
+    Args:
+        world: the true system.
+        scenario: the run.
+        channels: names of the C channels.
+        number: index of the run in the recording.
+
+    Returns:
+        Readings, (T, C).
     """
     times = scenario.times - scenario.times[0]
     instants = times
@@ -96,8 +108,18 @@ def solved(world: World, scenario: Scenario, channels: Sequence[str], number: in
 
 
 def simulated(world: World, scenario: Scenario, channels: Sequence[str]) -> Array:
-    """The same by MuJoCo, which knows no foreign causes; where one coordinate is not all that
-    moves, by the engine that knows more.
+    """Simulate a run with MuJoCo, without unmodelled causes, and return noise-free sensor readings.
+
+    Hidden-state effects move more than one coordinate, so they are simulated by the batch engine,
+    with a step of 2.5 ms.
+
+    Args:
+        world: the true system.
+        scenario: the run.
+        channels: names of the C channels.
+
+    Returns:
+        Readings, (T, C).
     """
     assert not world.foreign
     more = any(library.get(name).hook == "hidden" for name in world.effects)
@@ -114,13 +136,17 @@ def simulated(world: World, scenario: Scenario, channels: Sequence[str]) -> Arra
 
 
 def _read_at(system: str, channels: Sequence[str]) -> int:
-    """The column that gain, bias and drift act on."""
+    """Return the index of the channel on which sensor effects act."""
     preferred = {"ball": ("z", "x", "y"), "pendulum": ("q", "qd"), "slider": ("x", "v")}[system]
     return next(channels.index(name) for name in preferred if name in channels)
 
 
 def _refined(instants: Array) -> tuple[Array, NDArray[np.intp]]:
-    """A grid from 0 through all instants, and where they stand in it."""
+    """Refine a time grid from 0 through all sample times.
+
+    Returns:
+        The grid, and the index of each sample time in it.
+    """
     grid, rows = [0.0], []
     for instant in instants.tolist():
         if instant > grid[-1]:
@@ -131,11 +157,11 @@ def _refined(instants: Array) -> tuple[Array, NDArray[np.intp]]:
 
 
 def _lagged(values: Array, grid: Array, lag: float) -> Array:
-    """Y' = (x - y) / lag from y = x, for x straight between the grid's points."""
+    """Solve y' = (x - y) / lag with y = x at the start, for x linear between grid points."""
     result, y = values.copy(), values[0].copy()
     for k, h in enumerate(np.diff(grid).tolist()):
         slope = (values[k + 1] - values[k]) / h
-        ahead = values[k] - slope * lag  # the solution that stays `lag` behind the line
+        ahead = values[k] - slope * lag  # particular solution: `lag` seconds behind the line
         y = ahead + slope * h + (y - ahead) * exp(-h / lag)
         result[k + 1] = y
     return result

@@ -1,5 +1,6 @@
-"""What can be hidden in a machine, where, and how strongly: coefficients as a function of a
-strength, 1 being the far end of plausible.
+"""Causes that can be hidden in a machine: their places, and coefficients by strength.
+
+Strength 1 is the upper end of the plausible range.
 """
 
 from __future__ import annotations
@@ -33,15 +34,16 @@ INPUT = (
 SENSOR = ("sensor.bias", "sensor.delay", "sensor.drift", "sensor.gain")
 WORLD = ("gravity.scale", "gravity.tilt")
 _TAKEN_UP = {"drag.linear", "input.gain", "sensor.gain"}
-"""By a servo's own parameters, wholly or but for what hardly shows."""
+"""Effects that the parameters of a servo absorb entirely or almost entirely."""
 EFFECTS = {
     "servo": tuple(sorted({*JOINT, *INPUT, *SENSOR, "gravity.tilt", "servo.deadband"} - _TAKEN_UP)),
     "arm2": tuple(sorted({*JOINT, *INPUT, *SENSOR, *WORLD, "inertia.armature", "mass.scale"})),
 }
-"""By machine."""
+"""Effects that can be hidden, by machine."""
 FOREIGN = ("gust", "patch")
-"""Causes that the library does not have: a push for a while in every run, and dry friction in a
-part of a joint's travel.
+"""Causes that the library does not contain.
+
+They are a temporary force in every run, and dry friction in a part of a joint's travel.
 """
 SIGNED = (
     "force.bias",
@@ -65,11 +67,16 @@ _FAR = {
     "sensor.drift": 0.1,
     "sensor.gain": 0.3,
 }
-"""Of effects that need no scale of the motion."""
+"""Coefficient at strength 1 of effects that need no scale of the motion."""
 
 
 def places(system: str, effect: str) -> tuple[str, ...]:
-    """Where an effect or foreign cause can be: ``effect@place``, or ``effect`` alone."""
+    """List the places of an effect or unmodelled cause, as ``effect@place`` or ``effect`` alone.
+
+    Args:
+        system: servo or arm2.
+        effect: name of the effect or cause.
+    """
     plant = PLANTS[system]
     if effect in WORLD or system == "servo":
         return (effect,)
@@ -85,7 +92,12 @@ def places(system: str, effect: str) -> tuple[str, ...]:
 
 
 def joint_of(system: str, place: str) -> int:
-    """The joint that a place belongs to."""
+    """Return the index of the joint that a place belongs to.
+
+    Args:
+        system: servo or arm2.
+        place: name of a joint, body, motor or channel.
+    """
     plant = PLANTS[system]
     for names in (plant.joints, plant.bodies, plant.motors, plant.channels):
         if place in names:
@@ -94,7 +106,16 @@ def joint_of(system: str, place: str) -> int:
 
 
 def shape(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
-    """Coefficients of ``effect@place`` by strength."""
+    """Draw the shape of an effect at a place.
+
+    Args:
+        name: ``effect@place``, or ``effect`` alone.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Coefficients as a function of the strength.
+    """
     effect, _, place = name.partition("@")
     joint = joint_of(setting.system, place)
     typical = {what: float(values[joint]) for what, values in setting.typical.items()}
@@ -111,7 +132,7 @@ def shape(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
     return {
         "input.bias": lambda s: (sign * float(np.ptp(command)) / 2 * s,),
         "input.deadband": lambda s: (most * s,),
-        # At strength 0 at the command's peak, at 1 at nothing.
+        # Strength 0 limits the command at its peak, strength 1 at zero.
         "input.saturation": lambda s: (most * (1 - s),),
         "servo.deadband": lambda s: (0.3 * s,),
     }[effect]
@@ -151,7 +172,16 @@ _SHAPES: dict[str, Callable[..., Shape]] = {
 
 
 def foreign(name: str, setting: Setting, rng: np.random.Generator) -> Shape:
-    """Numbers of a foreign cause by strength."""
+    """Draw the shape of an unmodelled cause.
+
+    Args:
+        name: ``cause@joint``, or ``cause`` alone.
+        setting: recording conditions.
+        rng: random generator.
+
+    Returns:
+        Numbers of the cause as a function of the strength.
+    """
     cause, _, place = name.partition("@")
     joint = joint_of(setting.system, place)
     force = float(setting.typical["force"][joint])

@@ -1,17 +1,19 @@
-"""An arm's model file, as a user would have it: what it states is right, and what is hidden is not
-in it.
-"""
+"""Model file of the arm as a user would have it: correct, but without the hidden cause."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 NAME = "robot.xml"
-"""Of the file, beside the recording."""
+"""Name of the model file, in the folder of the recording."""
 
 
 def model_file(numbers: Mapping[str, float]) -> str:
-    """The MJCF of an arm; see `bench.diagnosis.worlds.machines.plants.Arm` for its numbers."""
+    """Render the MJCF text of an arm.
+
+    Args:
+        numbers: parameters; see `bench.diagnosis.worlds.machines.plants.Arm`.
+    """
     links = [
         (body, joint, {k.removesuffix(end): v for k, v in numbers.items() if k.endswith(end)})
         for body, joint, end in (("upper_arm", "shoulder", "1"), ("forearm", "elbow", "2"))
@@ -39,7 +41,7 @@ def model_file(numbers: Mapping[str, float]) -> str:
 
 
 def _link(body: str, joint: str, n: Mapping[str, float]) -> str:
-    """A link's inertia and joint; about its own axis it is as a thin rod would be."""
+    """Render the inertia and joint of a link; it is slender along its own axis."""
     moments = f"{n['inertia']!r} {n['inertia']!r} {0.1 * n['inertia']!r}"
     return (
         f'<inertial pos="0 0 {-n["centre"]!r}" mass="{n["mass"]!r}" diaginertia="{moments}"/>\n'

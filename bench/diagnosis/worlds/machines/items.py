@@ -1,8 +1,7 @@
-"""Questions about machines: what is hidden in which, how strongly, and the recording of it.
+"""Sampling of cases for servo and arm, and their recordings.
 
-Sizes are of first order: what is left of the change that a cause makes to the noiseless motion
-after parameters and initial states have taken up what they can, by least squares over their
-derivatives.
+Sizes are computed to first order: the RMS of the change that a cause makes to the noise-free
+motion, after the part is projected out that changes of parameters and initial states can explain.
 """
 
 from __future__ import annotations
@@ -26,18 +25,24 @@ from bench.diagnosis.worlds.sizing import sized
 from sims.base import Array
 
 SYSTEMS = tuple(PLANTS)
-"""Machines."""
+"""Names of the machines."""
 APART = 1.0
-"""Noises that must be left when only one of two effects, or no foreign cause, is in the model."""
+"""Minimum RMS residual that a wrong answer must leave, in units of the noise.
+
+A wrong answer is one of two hidden effects alone, or library effects for an unmodelled cause.
+"""
 TELLING = 0.4
-"""Noises that the simpler form of an effect must leave, or else it is the right answer."""
+"""Minimum RMS residual that the simpler form of an effect must leave, in units of the noise.
+
+Below it, the simpler form is a correct answer.
+"""
 SIMPLER = {"friction.stribeck": "friction.coulomb"}
 _NUDGE = 1e-4
-"""Of a number for its derivative: a share of a parameter, rad or rad/s of an initial state."""
+"""Finite-difference step: relative for a parameter, rad or rad/s for an initial state."""
 _PROBE = 0.1
-"""Strength at which other causes' directions are taken."""
+"""Strength at which the directions of other causes are computed."""
 _COARSE = 2.0
-"""Steps of these are so many times longer."""
+"""Factor of the step size when the directions of other causes are computed."""
 
 
 def draw(
@@ -48,7 +53,20 @@ def draw(
     size: float | None = None,
     wanted_so: Circumstances = ANY,
 ) -> Item | None:
-    """An item, or None where encoders cannot show it; see `bench.diagnosis.worlds.items.draw`."""
+    """Draw a case; see `bench.diagnosis.worlds.items.draw`.
+
+    Args:
+        kind: clean, single, double or foreign.
+        system: servo or arm2.
+        seed: seed from which everything else follows.
+        effect: hidden effect (the first one of a double case); None to draw it.
+        size: size in units of the noise; None to draw it.
+        wanted_so: recording conditions that are not drawn.
+
+    Returns:
+        The case, or None if the encoders cannot show the cause, or if another answer explains it
+        too well.
+    """
     words = [kind, system, effect or "any", *([f"{size:g}"] if size else [])]
     words += [str(part) for part in wanted_so if part is not None]
     name = "-".join([*words, str(seed)])
@@ -85,12 +103,22 @@ def _rng(name: str, purpose: str) -> np.random.Generator:
 
 @lru_cache(maxsize=4)
 def setting_of(name: str, system: str, asked: Circumstances = ANY) -> Setting:
-    """The circumstances in which the item of this name was drawn."""
+    """Restore the recording conditions of a case.
+
+    Args:
+        name: name of the case.
+        system: servo or arm2.
+        asked: conditions that were not drawn.
+    """
     return drawn_setting(system, _rng(name, "setting"), asked)
 
 
 def _placed(item: Item, effect: str | None, rng: np.random.Generator, but: str = "") -> str:
-    """Effect and place that are drawn, as far as they are not given."""
+    """Draw the effect, if it is not given, and its place.
+
+    Returns:
+        ``effect@place`` or ``effect``; empty if the only place is excluded by `but`.
+    """
     chosen = effect or str(rng.choice(causes.EFFECTS[item.system]))
     there = [name for name in causes.places(item.system, chosen) if name != but]
     return str(rng.choice(there)) if there else ""
@@ -117,7 +145,7 @@ def _single(
 def _sized(
     name: str, made: Setting, wanted: float, rng: np.random.Generator
 ) -> tuple[float, ...] | None:
-    """Coefficients at which a cause leaves the wanted size; None if there are none."""
+    """Find coefficients at which a cause has the requested size; None if there are none."""
     of = causes.shape(name, made, rng)
     gauge = _Gauge(made)
     strength = sized(lambda s: gauge.left(made.seen({name: of(s)})), wanted, 1.0)
@@ -127,7 +155,7 @@ def _sized(
 def _double(
     item: Item, made: Setting, effect: str | None, wanted: float, rng: np.random.Generator
 ) -> Item | None:
-    """Two effects, each of the wanted size alone; neither may look like more of the other."""
+    """Hide two effects, each of the requested size alone; reject the case if one explains both."""
     first = _placed(item, effect, rng)
     second = _placed(item, None, rng, but=first)
     if not second or second in same_class(item.system, first):
@@ -143,7 +171,7 @@ def _double(
 def _foreign(
     item: Item, made: Setting, cause: str | None, wanted: float, rng: np.random.Generator
 ) -> Item | None:
-    """A cause that the library does not have, and of which it explains only a part."""
+    """Hide an unmodelled cause, which the library explains only in part."""
     chosen = cause or str(rng.choice(causes.FOREIGN))
     joint = str(rng.choice(PLANTS[item.system].joints))
     name = f"{chosen}@{joint}" if joint else chosen
@@ -164,7 +192,10 @@ def _beyond(
     others: Sequence[str],
     rng: np.random.Generator,
 ) -> float:
-    """What the best of other causes leaves of a change, in noises, to first order."""
+    """Compute the RMS residual that the best of other causes leaves, to first order.
+
+    It is in units of the noise.
+    """
     gauge = _Gauge(made)
     change = made.seen(effects, foreign) - gauge.bare
     bare = made.seen(coarse=_COARSE)
@@ -178,13 +209,13 @@ def _beyond(
 
 
 class _Gauge:
-    """What parameters and initial states leave of a change, in noises.
+    """Sizes of changes, in units of the noise, with parameters and initial states projected out.
 
     Args:
-        made: its runs for fitting are those that count.
+        made: recording conditions; only the runs for fitting are used.
 
     Attributes:
-        bare: (R, T, N) what is seen with nothing hidden.
+        bare: readings without hidden causes, (R, T, N).
     """
 
     def __init__(self, made: Setting) -> None:
@@ -192,7 +223,7 @@ class _Gauge:
         runs, joints = made.fitted.q.shape
         numbers = list(made.parameters)
         lanes = 1 + len(numbers) + 2 * joints
-        # Every run once as it is, and once for every number that is fitted.
+        # Each run once as it is, and once for each fitted parameter and initial state.
         fitted = Runs(
             made.fitted.times,
             np.repeat(made.fitted.commands, lanes, axis=0),
@@ -220,11 +251,16 @@ class _Gauge:
         self._basis = _orthonormal(columns)
 
     def left(self, seen: Array) -> float:
-        """Of what is seen with something hidden."""
+        """Compute the size of the change in readings with a hidden cause."""
         return self._size((seen - self.bare).ravel())
 
     def projected(self, change: Array, direction: Array) -> float:
-        """What a direction besides leaves of a change."""
+        """Compute the size of a change after a further direction is projected out.
+
+        Args:
+            change: change of the readings, (R, T, N).
+            direction: direction of another cause, (R, T, N).
+        """
         rest, way = (self._rest(part.ravel()) for part in (change, direction))
         if way @ way > 0:
             rest = rest - way * (way @ rest) / (way @ way)
@@ -241,7 +277,7 @@ class _Gauge:
 
 
 def _orthonormal(columns: Array) -> Array:
-    """A basis of what columns span; what hardly stands apart from the others is left out."""
+    """Compute an orthonormal basis of the span of columns, without nearly dependent directions."""
     scale = np.sqrt(np.square(columns).sum(axis=0))
     left, sizes, _ = np.linalg.svd(columns / np.where(scale > 0, scale, 1.0), full_matrices=False)
     basis: Array = left[:, sizes > 1e-6 * sizes[0]]
@@ -249,7 +285,7 @@ def _orthonormal(columns: Array) -> Array:
 
 
 SAME: dict[str, tuple[frozenset[str], ...]] = {
-    # A motor that never reaches its limit turns a shift of the goal into a torque.
+    # A motor that never reaches its limit converts an offset of the goal into a torque.
     "servo": (frozenset({"force.bias", "input.bias"}),),
     "arm2": tuple(
         frozenset(names)
@@ -260,16 +296,25 @@ SAME: dict[str, tuple[frozenset[str], ...]] = {
         )
     ),
 }
-"""Causes that give the same motion exactly, whatever the data."""
+"""Causes that give exactly the same motion, by machine."""
 
 
 def same_class(system: str, name: str) -> frozenset[str]:
-    """The cause and all that are equivalent to it."""
+    """Return a cause and all causes that are equivalent to it.
+
+    Args:
+        system: servo or arm2.
+        name: ``effect@place`` or ``effect``.
+    """
     return frozenset({name}).union(*(names for names in SAME[system] if name in names))
 
 
 def recorded(item: Item) -> tuple[Setting, Array]:
-    """The setting of an item, and (R, T, N) what its encoders recorded."""
+    """Simulate the recording of a case.
+
+    Returns:
+        The recording conditions and the noisy encoder readings, (R, T, N).
+    """
     made = setting_of(item.name, item.system, item.asked)
     hidden = item.effects
     foreign = item.kind == "foreign"
@@ -280,7 +325,12 @@ def recorded(item: Item) -> tuple[Setting, Array]:
 
 
 def described(item: Item, made: Setting) -> dict[str, object]:
-    """The recording's description, as the document of a TOML file."""
+    """Build the description of the recording, as the document of a TOML file.
+
+    Args:
+        item: the case.
+        made: its recording conditions.
+    """
     robot = item.system == "arm2"
     plant = PLANTS[item.system]
     stated = {"noise": made.sigma} if item.stated else {}
@@ -302,7 +352,13 @@ def _stated_constants(made: Setting) -> dict[str, float]:
 
 
 def table(item: Item, made: Setting, seen: Array) -> str:
-    """The recording's table as CSV."""
+    """Format the recording as CSV text.
+
+    Args:
+        item: the case.
+        made: its recording conditions.
+        seen: encoder readings, (R, T, N).
+    """
     plant, robot = PLANTS[item.system], item.system == "arm2"
     inputs = [f"u.{name}" for name in plant.motors] if robot else ["goal", "torque_enable"]
     lines = [",".join(["run", "t", *inputs, *plant.channels])]
@@ -315,7 +371,15 @@ def table(item: Item, made: Setting, seen: Array) -> str:
 
 
 def written(item: Item, folder: Path) -> Path:
-    """Write the recording, its description and what lies beside it; the table's path."""
+    """Write the recording, its description and, for an arm, its model file.
+
+    Args:
+        item: the case.
+        folder: folder for the files.
+
+    Returns:
+        Path of the CSV file.
+    """
     import tomli_w
 
     made, seen = recorded(item)

@@ -1,10 +1,9 @@
-"""Machines in motion: Runge and Kutta's steps of fourth order, and dry friction that holds what
-pulls less; what is commanded on its way to the drive, and what sensors make of the motion.
+"""Integration of machine motion by Runge-Kutta 4 with dry friction; applied inputs and encoders.
 
-Within a step every joint that rubs keeps its way, or is held. Where one comes to rest in a step,
-the rest of that step is its own: it is held, or goes on with friction the other way (E. Hairer, S.
-P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, section II.6, for steps up
-to a change of the law).
+Within a step, each joint with dry friction either keeps its direction of motion or is stuck. If a
+joint comes to rest within a step, the rest of that step is computed separately: the joint sticks,
+or continues with friction in the other direction (E. Hairer, S. P. Norsett, G. Wanner, Solving
+Ordinary Differential Equations I, 1993, section II.6, for steps up to a change of the law).
 """
 
 from __future__ import annotations
@@ -17,20 +16,21 @@ from bench.diagnosis.worlds.machines.plants import Effects, Plant
 from sims.base import Array
 
 SMOOTH = 1e-3
-"""Seconds of a step where nothing rubs."""
+"""Step size without dry friction, seconds."""
 DRY = 5e-4
-"""The same where something does."""
+"""Step size with dry friction, seconds."""
 _LATER = 1e-9
-"""Share of its limit by which dry friction has to be exceeded."""
+"""Relative amount by which a force must exceed the dry friction limit to break a joint away."""
 
 
 class Runs(NamedTuple):
-    """Runs of one length side by side.
+    """Runs of equal length, simulated together.
 
     Attributes:
-        times: (T,) seconds from the first sample, evenly.
-        commands: (L, T, N), each held to the next sample.
-        q, v: (L, N) where they begin.
+        times: evenly spaced times from the first sample, seconds, (T,).
+        commands: commands, each held until the next sample, (L, T, N).
+        q: initial positions, (L, N).
+        v: initial velocities, (L, N).
     """
 
     times: Array
@@ -40,7 +40,13 @@ class Runs(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What came of it: (K,) times of the steps, (K, L, N) positions and rates there."""
+    """Simulated motion.
+
+    Attributes:
+        times: times of the steps, (K,).
+        q: positions, (K, L, N).
+        v: velocities, (K, L, N).
+    """
 
     times: Array
     q: Array
@@ -48,12 +54,12 @@ class Motion(NamedTuple):
 
 
 def moved(plant: Plant, runs: Runs, coarse: float = 1.0) -> Motion:
-    """The motion of a machine.
+    """Simulate the motion of a machine.
 
     Args:
-        plant: which.
-        runs: from where, and what is commanded.
-        coarse: steps are so many times longer.
+        plant: the machine.
+        runs: initial states and commands.
+        coarse: factor of the step size.
     """
     rate = runs.times[1] - runs.times[0]
     wanted = coarse * (DRY if plant.rubs.any() else SMOOTH)
@@ -100,7 +106,7 @@ class _Mover:
         return self._solved(q, force)
 
     def _solved(self, q: Array, force: Array) -> Array:
-        """Accelerations of joints that are not held, and none of the others."""
+        """Compute the accelerations (L, N); those of stuck joints are zero."""
         free = ~self.held
         inertia = self.plant.inertia(q)
         if self.held.any():
@@ -114,7 +120,7 @@ class _Mover:
         return np.asarray(solved, dtype=np.float64)
 
     def _decide(self, t: float, u: Array) -> None:
-        """Which joints at rest are held, and which way the others go."""
+        """Decide which joints at rest are stuck, and in which direction the others move."""
         resting = self.rubs & (self.v == 0.0)
         self.way = np.where(self.rubs & ~resting, np.sign(self.v), 0.0)
         self.held = resting
@@ -123,14 +129,14 @@ class _Mover:
         limit = self.plant.limit(self.q, self.v)
         force = self.plant.force(t, self.q, self.v, u) - self.way * limit
         accelerations = self._solved(self.q, force)
-        # What holds a joint still while the others move.
+        # Force needed to hold a joint still while the others move.
         need = force - np.einsum("lij,lj->li", self.plant.inertia(self.q), accelerations)
         loose = resting & (np.abs(need) > limit * (1 + _LATER))
         self.way = np.where(loose, np.sign(need), self.way)
         self.held = resting & ~loose
 
     def _turn(self, t: float, h: float, u: Array, before: Array) -> None:
-        """Joints that came to rest within the step: the rest of it with friction as it is then."""
+        """Recompute the rest of the step for joints that came to rest within it."""
         turned = (self.way * self.v < 0.0) & (self.way * before >= 0.0)
         if not turned.any():
             return
@@ -145,7 +151,16 @@ class _Mover:
 
 
 def felt_over(runs: Runs, plant: Plant, times: Array) -> Array:
-    """(L, K, N) the mean of each command over each step, as the drive gets it."""
+    """Compute the mean applied input over each step.
+
+    Args:
+        runs: the runs with their commands.
+        plant: the machine with its effects.
+        times: times of the steps, (K + 1,).
+
+    Returns:
+        Applied inputs, (L, K, N).
+    """
     lanes, _, joints = runs.commands.shape
     felt = np.empty((lanes, len(times) - 1, joints))
     for joint, motor in enumerate(plant.motors):
@@ -165,7 +180,7 @@ def felt_over(runs: Runs, plant: Plant, times: Array) -> Array:
 
 
 def _level(name: str, c: float, u: Array) -> Array:
-    """A command after an effect that has no memory."""
+    """Apply an effect without memory to a command."""
     match name:
         case "input.gain":
             return (1 + c) * u
@@ -179,8 +194,8 @@ def _level(name: str, c: float, u: Array) -> Array:
 
 
 def _means(stamps: Array, levels: Array, times: Array, late: float, lag: float) -> Array:
-    """Mean over each step of levels that hold, arrive late, and are approached with a lag."""
-    # The first holds before the first stamp, the last behind the last.
+    """Average levels over each step, with a zero-order hold, a delay and a lag."""
+    # The first level holds before the first sample, the last one after the last sample.
     ends = np.append(stamps[1:], times[-1] + 1.0)
     area = np.concatenate([[0.0], np.cumsum(levels * (ends - stamps))])
     at = times - late
@@ -191,13 +206,13 @@ def _means(stamps: Array, levels: Array, times: Array, late: float, lag: float) 
 
     over = integral(at)
     if lag > 0:
-        # x' = (u - x) / lag, so that what x lacks of u's area is lag times its own change.
+        # x' = (u - x) / lag, so the integral of x is that of u minus lag times the change of x.
         over = over - lag * _approached(stamps, levels, at, lag)
     return np.diff(over) / np.diff(times)
 
 
 def _approached(stamps: Array, levels: Array, at: Array, lag: float) -> Array:
-    """What follows the levels with a lag, at instants; it begins at the first level."""
+    """Evaluate a first-order lag of the levels at given times; it starts at the first level."""
     reached = np.empty_like(levels)
     reached[0] = levels[0]
     decay = np.exp(-np.diff(stamps) / lag)
@@ -210,7 +225,16 @@ def _approached(stamps: Array, levels: Array, at: Array, lag: float) -> Array:
 
 
 def read(motion: Motion, plant: Plant, times: Array) -> Array:
-    """(L, T, N) what encoders read at the times of samples."""
+    """Compute the encoder readings at the sample times.
+
+    Args:
+        motion: simulated motion.
+        plant: the machine with its effects.
+        times: sample times, (T,).
+
+    Returns:
+        Readings, (L, T, N).
+    """
     lanes, joints = motion.q.shape[1:]
     seen = np.empty((lanes, len(times), joints))
     for joint, channel in enumerate(plant.channels):
@@ -224,7 +248,15 @@ def read(motion: Motion, plant: Plant, times: Array) -> Array:
 
 
 def sensing(effects: Effects, channel: str) -> dict[str, tuple[float, ...]]:
-    """Effects of a channel's sensor, by their names."""
+    """Select the effects on the sensor of a channel.
+
+    Args:
+        effects: coefficients by name, with or without a place.
+        channel: name of the channel.
+
+    Returns:
+        Coefficients by name without the place.
+    """
     return {
         name.partition("@")[0]: tuple(c)
         for name, c in effects.items()
@@ -233,7 +265,7 @@ def sensing(effects: Effects, channel: str) -> dict[str, tuple[float, ...]]:
 
 
 def _between(motion: Motion, at: Array) -> Array:
-    """(T, L, N) positions at instants: the cubic through both ends of a step with both rates."""
+    """Interpolate the positions (T, L, N) by cubic Hermite polynomials."""
     h = motion.times[1] - motion.times[0]
     place = np.clip((at / h).astype(int), 0, len(motion.times) - 2)
     s = ((at - motion.times[place]) / h)[:, None, None]

@@ -1,16 +1,17 @@
-"""What moves, many lanes side by side: a servo that carries a pendulum, and an arm of two links.
+"""Equations of motion of a servo with a pendulum, and of an arm of two links, for batches of runs.
 
-Every law is written out here in plain numbers; nothing is shared with the simulators and the
-library that the questions are about. Arrays are (L, N), of L lanes and N joints; numbers of a
-machine are scalars, or (L,) where lanes differ in them.
+Every law is written here in plain numbers. Nothing is shared with the simulators and the effect
+library that the cases test. Arrays are (L, N) for L batch elements and N joints; parameters of a
+machine are scalars, or (L,) if they differ between batch elements.
 
-A servo, its angle q from hanging down, g gravity (R. Krishnan, Electric Motor Drives, 2001, chapter
-2, for the motor):
+Servo, with the angle q from hanging down and gravity g (R. Krishnan, Electric Motor Drives, 2001,
+chapter 2, for the motor):
 
     (J + m l^2) q'' = k (d V - k q') / R - m g l sin q,   d = clip(p e (goal - q), -1, 1)     (1)
 
-An arm that hangs in a vertical plane, q2 from the line of the first link (M. W. Spong, S.
-Hutchinson, M. Vidyasagar, Robot Modeling and Control, 2006, section 7.4), with rotors' inertias A:
+Arm in a vertical plane, with q2 measured from the line of the first link (M. W. Spong, S.
+Hutchinson, M. Vidyasagar, Robot Modeling and Control, 2006, section 7.4), and with the inertias A
+of the rotors:
 
     M11 = I1 + m1 c1^2 + I2 + m2 (l^2 + c2^2 + 2 l c2 cos q2) + A1                             (2)
     M12 = I2 + m2 (c2^2 + l c2 cos q2),   M22 = I2 + m2 c2^2 + A2                              (3)
@@ -30,29 +31,31 @@ from numpy.typing import NDArray
 from sims.base import Array
 
 Numbers = Mapping[str, Any]
-"""Of a machine, by name: scalars, or (L,)."""
+"""Parameters of a machine by name; each is a scalar or (L,)."""
 Effects = Mapping[str, Sequence[float]]
-"""Coefficients by ``effect@place``, or ``effect`` where a machine has one place for it."""
+"""Coefficients by ``effect@place``, or by ``effect`` if a machine has only one place for it."""
 Acts = Callable[[float, Array, Array, Array], Array]
-"""(t, q, v, u) to generalised forces (L, N)."""
+"""Function from (t, q, v, u) to generalised forces (L, N)."""
 GRAVITY = 9.81
 
 
 class Plant(ABC):
-    """A machine with whatever is hidden in it.
+    """Machine with hidden causes.
 
     Args:
-        numbers: see `Numbers`.
-        effects: of the library.
-        foreign: causes that it does not have.
+        numbers: parameters, see `Numbers`.
+        effects: hidden effects of the library.
+        foreign: hidden causes that the library does not contain.
 
     Attributes:
-        joints: their names; of a machine that has one place for an effect one that is empty.
-        channels: what its sensors read, by joint.
-        motors: inputs, by joint.
-        acts: what pushes besides.
-        dry: (N,) dry friction, and what Stribeck's law adds to it.
-        rubs: which joints have dry friction, (N,).
+        joints: names of the joints; one empty name if the machine has one place per effect.
+        channels: sensor channel of each joint.
+        motors: input of each joint.
+        acts: additional force laws.
+        dry: Coulomb friction, (N,).
+        extra: additional Stribeck friction at rest, (N,).
+        speed: Stribeck velocity, (N,).
+        rubs: whether each joint has dry friction, (N,).
     """
 
     joints: ClassVar[tuple[str, ...]]
@@ -79,14 +82,22 @@ class Plant(ABC):
 
     @property
     def rubs(self) -> NDArray[np.bool_]:
-        """Which joints have dry friction, (N,)."""
+        """Whether each joint has dry friction, (N,)."""
         rubs = (self.dry > 0) | (self.extra > 0)
         if self.patch:
             rubs[self.patch[0]] = True
         return rubs
 
     def limit(self, q: Array, v: Array) -> Array:
-        """(L, N) the largest dry friction."""
+        """Compute the dry friction limit.
+
+        Args:
+            q: positions, (L, N).
+            v: velocities, (L, N).
+
+        Returns:
+            Friction limits, (L, N).
+        """
         limit = np.tile(self.dry, (len(q), 1))
         if self.extra.any():
             limit += self.extra * np.exp(-((v / self.speed) ** 2))
@@ -97,7 +108,17 @@ class Plant(ABC):
         return limit
 
     def force(self, t: float, q: Array, v: Array, u: Array) -> Array:
-        """(L, N) of drives, gravity and whatever else, without dry friction; u is felt."""
+        """Compute the force of drives, gravity and effects, without dry friction.
+
+        Args:
+            t: time.
+            q: positions, (L, N).
+            v: velocities, (L, N).
+            u: applied inputs, (L, N).
+
+        Returns:
+            Forces, (L, N).
+        """
         total = self.own(q, v, u)
         for act in self.acts:
             total = total + act(t, q, v, u)
@@ -105,22 +126,31 @@ class Plant(ABC):
 
     @abstractmethod
     def inertia(self, q: Array) -> Array:
-        """(L, N, N)."""
+        """Compute the mass matrices, (L, N, N)."""
 
     @abstractmethod
     def own(self, q: Array, v: Array, u: Array) -> Array:
-        """(L, N) of everything but inertia in its equations of motion."""
+        """Compute all other terms of the equations of motion of the machine without effects.
+
+        Args:
+            q: positions, (L, N).
+            v: velocities, (L, N).
+            u: applied inputs, (L, N).
+
+        Returns:
+            Forces, (L, N).
+        """
 
     @abstractmethod
     def sideways(self, q: Array) -> Array:
-        """(L, N) forces of an acceleration of 1 along x."""
+        """Compute the generalised forces (L, N) of a unit acceleration along x."""
 
     @abstractmethod
     def weight(self, q: Array) -> Array:
-        """(L, N) gravity's."""
+        """Compute the generalised forces (L, N) of gravity."""
 
     def _take(self, effect: str, place: str, c: list[float]) -> None:
-        """Put an effect in; those of commands and sensors act elsewhere."""
+        """Add an effect; effects on commands and sensors are applied elsewhere."""
         if effect in LAWS:
             joint, law = self.joints.index(place), LAWS[effect]
 
@@ -147,7 +177,7 @@ class Plant(ABC):
             self._heavier(self.bodies.index(place), 1.0 + c[0])
 
     def _heavier(self, body: int, times: float) -> None:
-        """A body's mass and inertia, so many times."""
+        """Multiply the mass and inertia of a body by a factor."""
         for name in (f"mass{body + 1}", f"inertia{body + 1}"):
             self.numbers[name] = times * self.numbers[name]
 
@@ -176,25 +206,25 @@ LAWS: dict[str, Callable[[list[float], Array, Array], Array]] = {
         c[0] * np.sin(2 * np.pi * q / c[2]) + c[1] * np.cos(2 * np.pi * q / c[2])
     ),
 }
-"""Forces at a joint by its own motion: coefficients, q and v (L,)."""
+"""Forces at a joint as functions of its coefficients, positions (L,) and velocities (L,)."""
 
 
 class Servo(Plant):
-    """(1)."""
+    """Servo with a pendulum, equation (1)."""
 
     joints = ("",)
     channels = ("q",)
     motors = ("goal",)
 
     def inertia(self, q: Array) -> Array:
-        """See `Plant`."""
+        """Compute the mass matrices; see `Plant`."""
         n = self.numbers
         inertia = np.empty((len(q), 1, 1))
         inertia[:, 0, 0] = n["armature"] + n["mass"] * n["length"] ** 2 + self.added[0]
         return inertia
 
     def own(self, q: Array, v: Array, u: Array) -> Array:
-        """See `Plant`."""
+        """Compute the motor torque and gravity; see `Plant`."""
         n = self.numbers
         error = u[:, 0] - q[:, 0]
         if self.dull:
@@ -206,20 +236,23 @@ class Servo(Plant):
         return total
 
     def weight(self, q: Array) -> Array:
-        """See `Plant`."""
+        """Compute the gravity force; see `Plant`."""
         n = self.numbers
         weight: Array = -n["mass"] * n["gravity"] * n["length"] * np.sin(q[:, 0])
         return weight[:, None]
 
     def sideways(self, q: Array) -> Array:
-        """See `Plant`; x is to the right, where q is positive."""
+        """Compute the force of a unit acceleration along x, to the right where q is positive."""
         n = self.numbers
         sideways: Array = n["mass"] * n["length"] * np.cos(q[:, 0])
         return sideways[:, None]
 
 
 class Arm(Plant):
-    """(2) to (5); both joints turn about y, so that a positive angle is to the left of x."""
+    """Arm of two links, equations (2) to (5).
+
+    Both joints turn about y, so that a positive angle is on the negative side of x.
+    """
 
     joints = ("shoulder", "elbow")
     bodies = ("upper_arm", "forearm")
@@ -227,7 +260,7 @@ class Arm(Plant):
     motors = ("m_shoulder", "m_elbow")
 
     def inertia(self, q: Array) -> Array:
-        """See `Plant`."""
+        """Compute the mass matrices; see `Plant`."""
         n = self.numbers
         across = n["mass2"] * n["length"] * n["centre2"] * np.cos(q[:, 1])
         outer = n["inertia2"] + n["mass2"] * n["centre2"] ** 2
@@ -239,7 +272,7 @@ class Arm(Plant):
         return inertia
 
     def own(self, q: Array, v: Array, u: Array) -> Array:
-        """See `Plant`."""
+        """Compute inputs, gravity, Coriolis forces and damping; see `Plant`."""
         n = self.numbers
         turning = n["mass2"] * n["length"] * n["centre2"] * np.sin(q[:, 1])
         total = u + self.weight(q)
@@ -248,11 +281,11 @@ class Arm(Plant):
         return total
 
     def weight(self, q: Array) -> Array:
-        """See `Plant`."""
+        """Compute the gravity forces; see `Plant`."""
         return -GRAVITY * self._lever(np.sin, q)
 
     def sideways(self, q: Array) -> Array:
-        """See `Plant`."""
+        """Compute the forces of a unit acceleration along x; see `Plant`."""
         return -self._lever(np.cos, q)
 
     def _lever(self, of: Callable[[Array], Array], q: Array) -> Array:
@@ -263,4 +296,4 @@ class Arm(Plant):
 
 
 PLANTS: dict[str, type[Plant]] = {"servo": Servo, "arm2": Arm}
-"""Machines by the name of their system."""
+"""Classes of machines by the name of their system."""

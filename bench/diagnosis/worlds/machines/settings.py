@@ -1,5 +1,6 @@
-"""The circumstances of a machine's recordings: its numbers, runs, commands and noise, all drawn
-from a seed.
+"""Recording conditions of a machine case, drawn from a seed.
+
+They are the machine's parameters, runs, commands and noise.
 """
 
 from __future__ import annotations
@@ -17,31 +18,31 @@ from sims.base import Array
 from sims.servo.simulator import Servo as ServoSimulator
 
 SIGMA = (1e-3, 3e-3)
-"""Of the encoders, rad."""
+"""Range of the encoder noise, rad."""
 FITTED_OF = (3, 4, 5)
-"""Numbers of runs that are drawn."""
+"""Numbers of runs from which one is drawn."""
 SECONDS = (2.0, 3.0, 4.0)
-"""Lengths of runs that are drawn."""
+"""Lengths of a run from which one is drawn, seconds."""
 RATES = (50, 100)
-"""Sampling rates that are drawn, Hz."""
+"""Sampling rates from which one is drawn, Hz."""
 FARTHEST = 1.4
-"""rad that a joint goes from hanging down at most: beyond it the smallest push decides a lot."""
+"""Maximum joint angle from hanging down, rad; beyond it a small force decides the motion."""
 TRIES = 8
-"""Of commands that go too far, weaker each time."""
+"""Maximum number of attempts to scale commands down until the joints keep their angle limit."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """All of a machine's recording but what is hidden in it.
+    """Recording conditions of a machine case, without the hidden cause.
 
     Attributes:
         system: servo or arm2.
-        numbers: of the machine, by name.
-        runs: side by side.
-        noise: of the encoders.
-        rate: samples a second.
-        seconds: of a run.
-        held_out: how many of the last runs are held out.
+        numbers: parameters of the machine, by name.
+        runs: the runs.
+        noise: encoder noise.
+        rate: sampling rate, Hz.
+        seconds: length of a run.
+        held_out: number of held-out runs; they are the last ones.
     """
 
     system: str
@@ -54,44 +55,58 @@ class Setting:
 
     @property
     def sigma(self) -> float:
-        """Of every channel."""
+        """Standard deviation of the noise, equal for all channels."""
         return next(iter(self.noise.sigma.values()))
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Those that a user does not know: of a robot's file everything is stated."""
+        """Parameters that the user does not know: none for a robot, whose model file states all."""
         names = SERVO if self.system == "servo" else ()
         return {name: self.numbers[name] for name in names}
 
     @property
     def fitted(self) -> Runs:
-        """The runs that are for fitting."""
+        """The runs for fitting."""
         return self.some(len(self.runs.q) - self.held_out)
 
     def some(self, count: int) -> Runs:
-        """The first runs."""
+        """Return the first runs."""
         commands, q, v = (part[:count] for part in self.runs[1:])
         return Runs(self.runs.times, commands, q, v)
 
     def plant(self, effects: Effects | None = None, foreign: Effects | None = None) -> Plant:
-        """The machine with something hidden in it."""
+        """Make the machine with hidden causes.
+
+        Args:
+            effects: hidden effects of the library.
+            foreign: hidden unmodelled causes.
+        """
         return PLANTS[self.system](self.numbers, effects or {}, foreign or {})
 
     def seen(
         self, effects: Effects | None = None, foreign: Effects | None = None, coarse: float = 1.0
     ) -> Array:
-        """(R, T, N) what noiseless encoders read in the runs for fitting."""
+        """Simulate noise-free encoder readings of the runs for fitting.
+
+        Args:
+            effects: hidden effects of the library.
+            foreign: hidden unmodelled causes.
+            coarse: factor of the step size.
+
+        Returns:
+            Readings, (R, T, N).
+        """
         plant = self.plant(effects, foreign)
         return read(moved(plant, self.fitted, coarse), plant, self.runs.times)
 
     @cached_property
     def bare(self) -> Motion:
-        """The motion with nothing hidden, in the runs for fitting."""
+        """Motion of the runs for fitting without hidden causes."""
         return moved(self.plant(), self.fitted)
 
     @cached_property
     def typical(self) -> dict[str, Array]:
-        """Scales of that motion by joint, (N,) each."""
+        """Scales of the motion without hidden causes, by quantity; one value per joint, (N,)."""
         q, v = self.bare.q, self.bare.v
         a = np.gradient(v, self.bare.times, axis=0)
         lanes, joints = q.shape[1:]
@@ -108,14 +123,20 @@ class Setting:
 
 
 SERVO = ("torque_constant", "resistance", "armature")
-"""A servo's parameters, in the order of the simulator's."""
+"""Names of a servo's parameters, in the order of the simulator."""
 
 
 def setting(system: str, rng: np.random.Generator, asked: Circumstances = ANY) -> Setting:
-    """A setting drawn with `rng`."""
+    """Draw recording conditions.
+
+    Args:
+        system: servo or arm2.
+        rng: random generator.
+        asked: conditions that are not drawn.
+    """
     rate, seconds = int(rng.choice(RATES)), float(rng.choice(SECONDS))
     count = int(rng.choice(FITTED_OF))
-    # Drawn all the same: what follows is drawn as it is without wishes.
+    # These values are drawn in any case, so that later draws do not depend on the request.
     rate, count = asked.rate or rate, asked.runs or count
     times = np.arange(round(rate * seconds)) / rate
     numbers = _servo(rng) if system == "servo" else _arm(rng)
@@ -157,12 +178,12 @@ def _arm(rng: np.random.Generator) -> dict[str, float]:
         "damping2": rng.uniform(0.03, 0.12),
         "armature2": rng.uniform(0.002, 0.01),
     }
-    # As a file states them.
+    # Rounded as the model file states them.
     return {name: float(f"{value:.4g}") for name, value in numbers.items()}
 
 
 def _runs(plant: Plant, times: Array, count: int, rng: np.random.Generator) -> Runs:
-    """Runs with commands that stay within reach."""
+    """Draw runs whose commands keep the joints within the angle limit."""
     form = str(rng.choice(["steps", "sine", "chirp"]))
     joints = len(plant.joints)
     waves = np.array(
