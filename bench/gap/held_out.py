@@ -28,16 +28,16 @@ FOLLOWED = ((1.0, 6),)
 runs begin near their best states.
 """
 FAR = 1.5
-"""Mean square residual, in units of the noise, above which the best of the models that start from
-filtered states is also fitted in stages.
+"""Minimum mean square residual of the nearest model, in noise variances, for which models that
+start from filtered states are also fitted in stages.
 """
 BENT = 0.3
 """Maximum RMS linearisation error of a motion in units of the noise. Above it, the derivatives by
 the initial states are computed again.
 """
 NEARER = 3.0
-"""Minimum decrease of the sum of squares, in noise variances, for which fits are continued with
-derivatives at their own states.
+"""Minimum decrease of the sum of squares, in noise variances, by fresh derivatives, for which the
+fits are repeated with derivatives that are computed again before each stage.
 """
 TWICE = 2.0
 """Ratio of a model's sum of squares to that of the nearest model from which it is refitted on the
