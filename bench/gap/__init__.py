@@ -1,5 +1,6 @@
-"""explain: show what a simulation gets wrong, name the cause, extend the model, measure the gain.
+"""Diagnosis: locate the model discrepancy, identify its cause, extend the model, measure the gain.
 
-Read `explain` first: it is the order of events. `model` fits, `causes` finds and names, `measure`
-and `assess` put what was found into numbers, `verdict` is the answer, `report` tells a person.
+Start with `explain`, which runs the steps in order. `model` fits parameters, `causes` searches for
+missing effects, `measure` and `assess` compute intervals and gains, `verdict` holds the result, and
+`report` presents it.
 """

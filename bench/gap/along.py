@@ -1,8 +1,10 @@
-"""What else differs from run to run: how far and how fast it moved and which way, how strongly it
-was driven, when it was, and what further columns of the recording say, as a temperature.
+"""Run covariates: quantities that differ between runs and may explain a parameter trend.
 
-Of a number that belongs to a joint that joint's motion counts; else the system's first coordinate.
-The motion is the fitted model's, which has no noise.
+They are the amplitude, speed, direction and position of the motion, the size of each input, the
+order of the runs, and the extra columns of the recording, such as a temperature.
+
+A parameter of a joint is compared with the motion of that joint, any other parameter with the
+primary coordinate of the system. The motion is taken from the fitted model because it has no noise.
 """
 
 from __future__ import annotations
@@ -21,18 +23,18 @@ Kind = Literal[
 ]
 
 LOADS = ("kg", "kg*m^2", "N", "N*m")
-"""Units of constants that are loads."""
+"""Units by which a constant is recognised as a load."""
 BARE = 1e-3
-"""Share of its own size by which something has to differ between runs to be of any use."""
+"""Minimum variation of a covariate between runs, as a fraction of its largest magnitude."""
 
 
 class Along(NamedTuple):
-    """Something that differs from run to run.
+    """Quantity that differs between runs.
 
     Attributes:
-        kind: what it is to whoever asks what is missing.
-        name: in words; of an extra column its name.
-        values: (R,) of each run, in any unit.
+        kind: Category of the quantity.
+        name: Quantity in words; for an extra column its name.
+        values: (R,) value of each run, in any unit.
     """
 
     kind: Kind
@@ -41,13 +43,24 @@ class Along(NamedTuple):
 
 
 def along(world: World, model: Model, number: str) -> list[Along]:
-    """What differs between the runs of a world, as far as it may move a number of a model."""
+    """List the quantities that differ between the runs and may explain a trend of a parameter.
+
+    Args:
+        world: Run evaluator with the runs.
+        model: Fitted model whose simulated motion is used.
+        number: Name of the parameter, ``parameter`` or ``parameter@joint``.
+    """
     everything = [*_apart_from_motion(world), *_motion(world, model, number)]
     return [one for one in everything if _differs(one.values)]
 
 
 def constant(world: World, name: str) -> Kind:
-    """What a constant is that differs between runs."""
+    """Return the category of a constant that differs between runs, from its unit.
+
+    Args:
+        world: Run evaluator; its simulator declares the constants.
+        name: Name of the constant.
+    """
     units = {constant.name: constant.unit for constant in world.kind.constants}
     unit = units.get(name, "")
     if unit in LOADS:
@@ -67,7 +80,7 @@ def _apart_from_motion(world: World) -> Iterator[Along]:
 
 
 def _motion(world: World, model: Model, number: str) -> Iterator[Along]:
-    """How the coordinate moved that a number is about."""
+    """Yield amplitude, speed, direction and position of the coordinate of a parameter."""
     system = world.simulator.system
     if not system.coordinates:
         return

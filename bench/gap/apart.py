@@ -1,30 +1,34 @@
-"""Which number to trust: what each run, log or load says of a number by itself.
+"""Run consistency: test whether runs, logs or loads agree on each parameter.
 
-About the joint fit, with the whitened derivatives J_r = [A_r B_r] of run r, by parameters and by
-its initial states, its residual e_r, and what was known of these states beforehand, sigma_0,
+The test works at the joint fit. J_r = [A_r B_r] are the whitened derivatives of run r with respect
+to the parameters and to the initial states of the run, e_r is the residual, and sigma_0 is the
+prior standard deviation of the initial states:
 
     H_r = A_r' A_r - A_r' B_r S_r^-1 B_r' A_r,    S_r = B_r' B_r + diag sigma_0^-2
     g_r = A_r' e_r - A_r' B_r S_r^-1 (B_r' e_r + prior)                                          (1)
 
-a group G of runs alone would move the parameters by (one step of Gauss and Newton)
+A group G of runs alone would change the parameters by one Gauss-Newton step,
 
     d_G = H_G^-1 g_G,    cov_G = H_G^-1,    H_G = sum_r H_r,  g_G = sum_r g_r                    (2)
 
-and the groups agree on a number x if (W. Cochran, Biometrics 10, 101, 1954), over those that fix
-it,
+The groups that identify a parameter x agree on it according to Cochran's Q (W. Cochran, Biometrics
+10, 101, 1954), which follows a chi-squared distribution with one degree of freedom less than the
+number n of groups:
 
-    Q = sum_G w_G (x_G - mean)^2,    w_G = 1 / var_G,    Q ~ chi^2 of one less                   (3)
+    Q = sum_G w_G (x_G - mean)^2,    w_G = 1 / var_G,    Q ~ chi^2 with n - 1                    (3)
 
-What they scatter beyond that is (R. DerSimonian, N. Laird, Control. Clin. Trials 7, 177, 1986)
+The variance between groups beyond their errors is (R. DerSimonian, N. Laird, Control. Clin. Trials
+7, 177, 1986)
 
     tau^2 = (Q - (n - 1)) / (sum w - sum w^2 / sum w)                                            (4)
 
-so that a number is known, for a run not yet recorded, to
+The variance of a parameter for a run that is not yet recorded is therefore
 
     var = var_joint + tau^2                                                                      (5)
 
-Against a number z of the groups, a load or the order of logs, it moves by the slope of weighted
-least squares, whose error grows with the scatter about it (R. Birge, Phys. Rev. 40, 207, 1932).
+The trend with a covariate z of the groups, such as a load or the order of logs, is the slope of
+weighted least squares. Its error is enlarged by the scatter about the line (R. Birge, Phys. Rev.
+40, 207, 1932).
 """
 
 from __future__ import annotations
@@ -46,20 +50,24 @@ from sims.base import Array
 from sims.recording.recording import Run
 
 LEVEL = 0.01
-"""Chance of (3) below which groups do not agree, shared by all numbers that are asked about."""
+"""Significance level of test (3), divided by the number of tests for all parameters together."""
 SLIGHT = 1e-3
-"""Share of a number below which nobody minds what groups scatter, however sure it is."""
+"""Scatter below which groups count as consistent at any p-value, as a fraction of the value."""
 FEWEST = 4
-"""Groups from which it is asked what a number moves with."""
+"""Minimum number of groups for which a trend covariate is searched."""
 ALIKE = 2.0
-"""Times the least mean square about its line, what else may be what a number moves with."""
+"""Maximum ratio of the mean square about the line to the smallest one, for a covariate that counts
+as indistinguishable from the best.
+"""
 WIDE = 4.0
-"""A group whose interval is wider than so many times the bounds says nothing of a number."""
+"""Maximum width of a group's 95 % interval, as a multiple of the parameter's range or value, for
+the group to be used.
+"""
 
 
 @dataclass(frozen=True)
 class Part:
-    """What one group says of a number: its value, and 1 sigma."""
+    """Estimate of one parameter from one group of runs: its value and its standard error."""
 
     group: str
     value: float
@@ -68,7 +76,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Trend:
-    """How a number moves with one of the groups: its slope, 1 sigma of it, and its chance."""
+    """Linear trend of a parameter over the groups: slope, its standard error and its p-value."""
 
     slope: float
     error: float
@@ -77,7 +85,14 @@ class Trend:
 
 @dataclass(frozen=True)
 class Mover:
-    """What a number moves with: its kind and name (`along`), how, and what else would do."""
+    """Covariate with which a parameter moves between groups.
+
+    Attributes:
+        kind: Category of the covariate (`bench.gap.along`).
+        name: Name of the covariate.
+        trend: Trend of the parameter with the covariate.
+        also: Names of other covariates that explain the trend about as well.
+    """
 
     kind: Kind
     name: str
@@ -87,20 +102,21 @@ class Mover:
 
 @dataclass(frozen=True)
 class Spread:
-    """What groups of runs say of one number.
+    """Consistency of one parameter between groups of runs.
 
     Attributes:
-        number: its name; of a cause's coefficient with the effect.
-        unit: of it.
-        by: what the groups are: ``run``, ``log`` or a constant that differs between runs.
-        value: of the joint fit.
-        error: 1 sigma of it, by curvature.
-        parts: the groups that fix it.
-        scatter: tau of (4), what they differ by beyond their errors.
-        chance: of (3).
-        agree: whether they do.
-        trend: with a constant, or with the order of logs; None where there are too few.
-        mover: what it moves with, if it is sure; None where the groups agree.
+        number: Name of the parameter; for a coefficient of a cause, it includes the effect.
+        unit: Unit of the parameter.
+        by: Criterion of the groups: ``run``, ``log`` or a constant that differs between runs.
+        value: Estimate of the joint fit.
+        error: Standard error of the joint estimate, from the curvature.
+        parts: Estimates of the groups that identify the parameter.
+        scatter: Tau of (4), the standard deviation between groups beyond their errors.
+        chance: P-value of test (3).
+        agree: Whether the groups are consistent.
+        trend: Trend with a constant or with the order of logs; None by run or with fewer than three
+            groups.
+        mover: Significant trend covariate; None if there is none or the groups agree.
     """
 
     number: str
@@ -117,14 +133,18 @@ class Spread:
 
     @property
     def total(self) -> float:
-        """1 sigma for a run not yet recorded, (5)."""
+        """Standard error for a run that is not yet recorded, (5)."""
         return float(np.hypot(self.error, self.scatter))
 
 
 @dataclass(frozen=True)
 class Apart:
-    """What groups of runs say of the numbers of the base model, of those of what was found, and of
-    the coefficients of the best effect that was not needed.
+    """Consistency of parameters between groups of runs.
+
+    Attributes:
+        before: Parameters of the base model.
+        after: Parameters of the extended model.
+        rival: Coefficients of the best single effect that is not part of the diagnosis.
     """
 
     before: tuple[Spread, ...] = ()
@@ -134,7 +154,7 @@ class Apart:
 
 @dataclass(frozen=True)
 class _Grouping:
-    """Runs in groups, by what, and the number of each group where it has one."""
+    """Runs in groups: the criterion, names and run indices, and the value of each group if any."""
 
     by: str
     names: tuple[str, ...]
@@ -143,11 +163,14 @@ class _Grouping:
 
 
 def spreads(models: Models, model: Model) -> tuple[Spread, ...]:
-    """What runs, logs and loads say of each number of a fitted model by themselves.
+    """Assess the consistency of each parameter of a fitted model between runs, logs and loads.
 
     Args:
-        models: of the runs.
-        model: fitted to all of them.
+        models: Models of the runs.
+        model: Model that is fitted to all runs.
+
+    Returns:
+        One entry for each parameter and grouping; empty without groups or free parameters.
     """
     world = models.world
     groupings = list(_groupings(world.runs))
@@ -166,7 +189,7 @@ def spreads(models: Models, model: Model) -> tuple[Spread, ...]:
 
 
 def _mover(world: World, model: Model, by: _Grouping, one: Spread) -> Mover | None:
-    """What the groups' values of a number move with."""
+    """Find the covariate with which the group estimates of a parameter move."""
     if by.by not in ("run", "log"):
         if one.trend is None or one.trend.chance >= LEVEL:
             return None
@@ -182,13 +205,13 @@ def _mover(world: World, model: Model, by: _Grouping, one: Spread) -> Mover | No
     if not sure:
         return None
     least, best, trend = min(sure, key=lambda entry: entry[0])
-    # What goes along with it as well cannot be told from it.
+    # A covariate that fits about as well cannot be distinguished from the best one.
     also = [about.name for rest, about, _ in sure if about is not best and rest < ALIKE * least]
     return Mover(best.kind, best.name, trend, tuple(also))
 
 
 def _rest(parts: Sequence[Part], numbers: Array) -> float:
-    """Weighted mean square about the line of `_trend`, at least what errors make of it."""
+    """Compute the weighted mean square about the line of `_trend`; at least 1, its expectation."""
     values = np.array([part.value for part in parts])
     weights = np.array([part.error for part in parts]) ** -2.0
     rest = values - np.polyval(np.polyfit(numbers, values, 1, w=np.sqrt(weights)), numbers)
@@ -201,7 +224,7 @@ def _judged(one: Spread, level: float) -> Spread:
 
 
 def _groupings(runs: Sequence[Run]) -> Iterator[_Grouping]:
-    """By logs where there are several, by each constant that differs, else by run."""
+    """Yield the groupings by log, by each constant that differs between runs, and by run."""
     logs = tuple(dict.fromkeys(run.log for run in runs))
     if len(logs) > 1:
         places = tuple(tuple(i for i, run in enumerate(runs) if run.log == log) for log in logs)
@@ -219,7 +242,7 @@ def _groupings(runs: Sequence[Run]) -> Iterator[_Grouping]:
 
 
 def _by_run(models: Models, model: Model) -> tuple[Array, Array]:
-    """(R, q, q) and (R, q) of (1)."""
+    """Compute the normal equations of each run: H (R, q, q) and g (R, q) of (1)."""
     world, fit = models.world, model.fit
     q = fit.free.size
     found = curved(models, model)
@@ -273,7 +296,7 @@ def _spreads(
 
 
 def _inverse(curvature: Array) -> Array:
-    """Its inverse; directions that these runs do not fix have a huge one."""
+    """Invert a curvature matrix; directions that the runs do not identify get a huge variance."""
     scale = np.sqrt(np.maximum(np.diagonal(curvature), 1e-200))
     values, vectors = np.linalg.eigh(curvature / np.outer(scale, scale))
     result: Array = (vectors / np.maximum(values, 1e-12)) @ vectors.T / np.outer(scale, scale)
@@ -281,7 +304,7 @@ def _inverse(curvature: Array) -> Array:
 
 
 def _heterogeneity(parts: Sequence[Part]) -> tuple[float, float]:
-    """Tau of (4) and the chance of (3)."""
+    """Compute tau of (4) and the p-value of (3)."""
     values = np.array([part.value for part in parts])
     weights = np.array([part.error for part in parts]) ** -2.0
     mean = float(weights @ values / weights.sum())
@@ -293,7 +316,7 @@ def _heterogeneity(parts: Sequence[Part]) -> tuple[float, float]:
 
 
 def _trend(parts: Sequence[Part], numbers: Array) -> Trend | None:
-    """Weighted least squares against the groups' number; None for fewer than three."""
+    """Fit a weighted least-squares line to the groups; None for fewer than three groups."""
     if len(parts) < 3 or not np.ptp(numbers) > 0:
         return None
     values = np.array([part.value for part in parts])
@@ -305,7 +328,7 @@ def _trend(parts: Sequence[Part], numbers: Array) -> Trend | None:
     freedom = len(parts) - 2
     ratio = float(weights @ rest**2) / freedom
     error = float(np.sqrt(max(ratio, 1.0) / power))
-    # Errors that the scatter bears out are known; those that it enlarges are estimated.
+    # If the scatter agrees with the errors, these are known; otherwise they are estimated.
     size = abs(slope) / error
     return Trend(slope, error, erfc(size / sqrt(2.0)) if ratio <= 1.0 else _student(size, freedom))
 

@@ -1,4 +1,4 @@
-"""Puts what was found into numbers: intervals, the held-out gain, the ranked candidates."""
+"""Build the verdict from a finding: intervals, held-out gain and ranked candidates."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from sims.robot.causes import GRAVITY_COMPENSATED, is_gravity_compensated
 from sims.system import Effect, members_of
 
 WORST = -9.0
-"""A candidate's share of the held-out gap is cut here: it has made things worse, by whatever."""
+"""Lower limit of a candidate's reported share of the held-out gap; it only means "worse"."""
 
 
 @dataclass(frozen=True)
 class Assessor:
-    """Puts a finding into numbers.
+    """Builds the verdict and its numbers from a finding.
 
     Attributes:
-        recording: what was explained.
-        fitting: the runs for fitting.
-        validation: predicts held-out runs, or each run by cross-validation; None without either.
-        floor: the noise.
-        engine: the engine's name; None for a simulator that steps itself.
-        before: what the simulation gave of the held-out runs before its own step was mended; None
-            where that was not at fault.
+        recording: Recording that is explained.
+        fitting: Run evaluator of the runs for fitting.
+        validation: Validation on held-out runs or by cross-validation; None without either.
+        floor: Noise floor of each channel.
+        engine: Name of the engine; None for a simulator with its own integrator.
+        before: Base prediction of the held-out runs with the model file's own step, if that step
+            was found too coarse; otherwise None.
     """
 
     recording: Recording
@@ -63,25 +63,25 @@ class Assessor:
 
     @property
     def _by_stretches(self) -> bool:
-        """Whether gains are resampled by stretches of runs: cross-validated runs are few."""
+        """Return whether gains are resampled by segments, because cross-validated runs are few."""
         return self.validation is not None and self.validation.is_cross_validation
 
     def verdict(
         self, search: Search, finding: Finding, rng: np.random.Generator, started: float
     ) -> Verdict:
-        """The verdict on a finding.
+        """Build the verdict for a finding.
 
         Args:
-            search: that has found it.
-            finding: what was found.
-            rng: of the bootstrap.
-            started: `time.perf_counter` at the beginning.
+            search: Search that produced the finding.
+            finding: Outcome of the search.
+            rng: Random generator of the bootstrap.
+            started: Value of `time.perf_counter` at the start of the diagnosis.
         """
         world = self.fitting
         numbers = self.numbers(search, finding.model)
         causes = self.causes(search, finding)
         parameters = {world.parameters[i].name: numbers[i] for i in world.base.tolist()}
-        # Counted before an experiment is proposed: what that simulates is not part of the answer.
+        # Simulations for the proposal of an experiment are not part of the answer.
         simulations = world.simulations
         if self.validation is not None:
             simulations += self.validation.simulations
@@ -103,26 +103,37 @@ class Assessor:
         )
 
     def causes(self, search: Search, finding: Finding) -> tuple[Cause, ...]:
-        """The causes of a finding with their numbers."""
+        """Return the causes of a finding with their fitted numbers.
+
+        Args:
+            search: Search that produced the finding.
+            finding: Outcome of the search.
+        """
         numbers = self.numbers(search, finding.model)
         return tuple(self._cause(cause, numbers) for cause in finding.causes)
 
     def numbers(self, search: Search, model: Model) -> dict[int, Number]:
-        """Every parameter and coefficient by its place; without an interval where it was not
-        fitted.
+        """Collect the estimates of all parameters and coefficients by index.
+
+        Args:
+            search: Search that produced the model.
+            model: Fitted model.
+
+        Returns:
+            Estimates by index in the parameter vector; those that were not fitted have no interval.
         """
         fitted = intervals(search, model)
         ranges = self._ranges(model)
         result = {}
         for place, parameter in enumerate(self.fitting.parameters):
-            # What the data do not touch stays nominal; effects that are off are zero.
+            # Insensitive parameters stay nominal; effects that are not in the model are zero.
             given = float(model.fit.theta[place]), np.nan, np.nan
             value, low, high = fitted.get(place, given)
             if is_instant(parameter):
-                # Nobody knows when between two samples it was.
+                # The time of an event is only known to one sample spacing.
                 low, high = low - self.fitting.spacing / 2, high + self.fitting.spacing / 2
             at_bound = bound_of(value, *ranges[place]) if place in fitted else None
-            # JSON has no number for what is not known; at a bound the curvature says nothing.
+            # JSON has no number for an unknown bound; at a bound the curvature gives no interval.
             bounded = np.isfinite(low) and np.isfinite(high) and at_bound is None
             ends = (low, high) if bounded else (None, None)
             usual = self._usual(place) if place in fitted else parameter.bounds
@@ -133,23 +144,23 @@ class Assessor:
         return self._with_totals(model, result)
 
     def _usual(self, place: int) -> tuple[float, float]:
-        """The plausible range of a number: of a robot's free number narrower than its bounds."""
+        """Return the plausible range, narrower than the bounds for a robot's free numbers."""
         parameter = self.fitting.parameters[place]
         free = self.fitting.kind.has_model and place in self.fitting.base
         return parameter.training or parameter.bounds if free else parameter.bounds
 
     def _with_totals(self, model: Model, numbers: dict[int, Number]) -> dict[int, Number]:
-        """The numbers of a robot with what becomes of those that its model file states."""
+        """Add specified and resulting values to the numbers that a robot's model file contains."""
         kind: Any = self.fitting.kind
         if not kind.has_model:
             return numbers
-        # Loaded where there is a robot alone.
+        # This import is needed for robots only.
         from sims.robot.totals import totals
 
         placed = list(self._placed(model))
         fitted = [(effect, [numbers[i].value for i in places]) for effect, places in placed]
         for (effect, places), made in zip(placed, totals(kind.robot, fitted), strict=True):
-            # The model file keeps its gravity where bodies are compensated.
+            # The model file keeps its gravity if the bodies are gravity-compensated.
             keeps = is_gravity_compensated(effect.name, {"": numbers[places[0]]})
             if keeps or not any(numbers[i].value for i in places):
                 continue
@@ -161,9 +172,9 @@ class Assessor:
         return numbers
 
     def _placed(self, model: Model) -> Iterator[tuple[type[Effect], list[int]]]:
-        """The effects at one place each that were fitted, with the places of their numbers."""
+        """Yield the fitted effects with a single place, and the indices of their coefficients."""
         world, kind = self.fitting, cast(Any, self.fitting.kind)
-        # The user's free numbers come first, in the order of their effects.
+        # The free numbers of the user come first, in the order of their effects.
         places = iter(range(world.own))
         for effect in kind.system.freed_effects:
             yield effect, [next(places) for _ in effect.coefficients]
@@ -171,13 +182,13 @@ class Assessor:
             effect = world.effects[name]
             members = members_of(effect)
             places = iter(world.places(name))
-            # A family with one number for all places changes no number of the file.
+            # A family with one coefficient for all places changes no number of the file.
             if sum(len(member.coefficients) for member in members) == len(world.places(name)):
                 for member in members:
                     yield type(member), [next(places) for _ in member.coefficients]
 
     def _ranges(self, model: Model) -> dict[int, tuple[float, float]]:
-        """Where the fit of a model could move each number, by its place."""
+        """Return the range of each fitted number, by index in the parameter vector."""
         world = self.fitting
         ranges = {i: world.parameters[i].bounds for i in world.base.tolist()}
         for name in model.names:
@@ -185,7 +196,12 @@ class Assessor:
         return ranges
 
     def judged(self, search: Search, finding: Finding) -> Finding:
-        """The finding with the verdict that its numbers and the fitted models allow."""
+        """Return the finding with the verdict that its numbers and the fitted models allow.
+
+        Args:
+            search: Search that produced the finding.
+            finding: Outcome of the search.
+        """
         if finding.verdict == "unknown" and self._refutes(search, finding):
             return replace(finding, verdict="adequate")
         numbers = self.numbers(search, finding.model)
@@ -195,9 +211,11 @@ class Assessor:
         return replace(finding, verdict=rules.verdict_of_numbers(finding.verdict, results))
 
     def _refutes(self, search: Search, finding: Finding) -> bool:
-        """Whether a linear score is all that speaks for something missing, and no fitted model with
-        it explains the data better, or none predicts the held-out runs better. In closed loops and
-        at rest, derivatives may promise what no fit delivers.
+        """Return whether fitted models refute a missing effect that only the linear score suggests.
+
+        This is so if no fitted model with effects has a higher penalised log-likelihood than the
+        base model, or none predicts the held-out runs better. In closed loops and at rest,
+        derivatives may predict a gain that no fit achieves.
         """
         if finding.causes or finding.remains.structure or finding.cut is not None:
             return False
@@ -212,9 +230,7 @@ class Assessor:
         )
 
     def _held_out_excess(self, finding: Finding) -> float | None:
-        """RMS of what the base model leaves of held-out runs in units of the noise, less one; None
-        where none were simulated.
-        """
+        """Return the excess RMS residual of the base model on held-out runs; None without them."""
         runs, measured = self.measuring, finding.measured
         if runs is None or measured is None or () not in measured:
             return None
@@ -222,26 +238,31 @@ class Assessor:
         return float(np.sqrt(np.square(left[np.isfinite(runs.observed)]).mean())) - 1.0
 
     def _ends_at_bound(self, numbers: Mapping[int, Number]) -> bool:
-        """Whether a base parameter of the extended model lies at a bound of its range: a cause may
-        then stand for a value beyond it.
+        """Return whether a base parameter of the extended model is at a bound of its range.
+
+        A cause may then compensate for a value beyond the bound.
         """
         fitted = [numbers[i] for i in self.fitting.base.tolist()]
         return any(n.at_bound is not None and not n.is_result for n in fitted)
 
     def sigma(self, finding: Finding) -> Array:
-        """(C,) the noise floor: stated, or what a model that leaves no structure leaves."""
+        """Return the noise floor (C,).
+
+        It is the specified noise, or else the residual of a model without lack of fit.
+        """
         left = finding.model.likelihood.sigma
-        # The estimate takes noise for white, so what is left of a good model may exceed it.
+        # The noise estimate assumes white noise, so the residual of a good model may exceed it.
         usable = ~self.floor.stated & np.isfinite(left) & (left > self.floor.sigma)
         return np.where(usable & (not finding.remains.structure), left, self.floor.sigma)
 
     def _cause(self, evidence: Evidence, numbers: dict[int, Number]) -> Cause:
         world = self.fitting
-        # An effect's coefficients lie side by side in the parameter vector, in its own order.
+        # The coefficients of an effect are contiguous in the parameter vector, in the effect's
+        # order.
         effect = world.effects[evidence.effect]
         coefficients = effect.on(world.simulator.system)
         places = range(*world.slots[evidence.effect].indices(len(world.parameters)))
-        # A coefficient that cannot be observed is fixed at zero, and is no finding.
+        # A coefficient that cannot be observed is fixed at zero and is not a result.
         by_name = {
             c.name: numbers[i]
             for c, i in zip(coefficients, places, strict=True)
@@ -256,16 +277,16 @@ class Assessor:
         return Cause(evidence.effect, evidence.alternatives, says, by_name, evidence.p_value, form)
 
     def _counted(self) -> list[int]:
-        """Channels that share the unit of the one that sensor effects act on."""
+        """List the channels with the same unit as the channel that sensor effects act on."""
         world = self.fitting
         units = [channel.unit for channel in world.simulator.channels]
         reading = world.simulator.system.reading(world.channels)
-        # Errors of different units have no sum.
+        # Errors of different units cannot be added.
         unit = units[world.channels.index(reading)]
         return [c for c, other in enumerate(units) if other == unit]
 
     def _floor_of(self, finding: Finding) -> float:
-        """RMS of the noise over the channels that count."""
+        """Compute the RMS of the noise floor over the channels that count."""
         return float(np.sqrt(np.square(self.sigma(finding)[self._counted()]).mean()))
 
     def _heldout(self, finding: Finding, rng: np.random.Generator) -> Heldout | None:
@@ -274,7 +295,7 @@ class Assessor:
             return None
         before, after = measured[()].simulated, measured[names].simulated
         before = before if self.before is None else self.before
-        # The base model failed there, so there is no gap to speak of.
+        # Without a prediction of the base model there is no gap to measure.
         if not np.isfinite(before[np.isfinite(runs.observed)]).all():
             return None
         counted = self._counted()
@@ -283,8 +304,10 @@ class Assessor:
         return _heldout(result, self.fitting.simulator.channels[counted[0]].unit)
 
     def _candidates(self, search: Search, finding: Finding) -> tuple[Candidate, ...]:
-        """The whole library with its evidence about the base model, the strongest first; a score is
-        less what numbers beyond the first cost, so that a law comes before those that contain it.
+        """List all effects of the library with their scores about the base model, best first.
+
+        A score is reduced by the price of each coefficient beyond the first, so that an effect
+        precedes more general effects that contain it.
         """
         scores = search.about_base
         if scores is None:
@@ -293,7 +316,7 @@ class Assessor:
         rows = []
         for i, effect in enumerate(scores.effects):
             score = float(scores.score[i])
-            # A fit may gain more than the linear score promises: far from the data it often does.
+            # A fit may gain more than the linear score predicts, in particular far from the data.
             alone = search.models.get(frozenset({effect}))
             if alone is not None:
                 score = max(score, float(alone.likelihood.value - base))
@@ -306,24 +329,29 @@ class Assessor:
         return tuple(sorted(rows, key=lambda row: -row.score))
 
     def _share(self, finding: Finding, names: Names) -> float | None:
-        """Share of the held-out gap that a model closes; None where it was not measured."""
+        """Return the share of the held-out gap that a model closes; None if it is not measured."""
         runs, measured = self.measuring, finding.measured
         if runs is None or measured is None or names not in measured:
             return None
         counted = self._counted()
         floor = self._floor_of(finding)
-        # As the gain of the whole model is counted: nothing below the floor is a gain.
+        # As for the gain of the whole model, an error below the noise floor is not a gain.
         before = _rmse(runs, measured[()].simulated, counted)
         after = _rmse(runs, measured[names].simulated, counted)
         share = 0.0
-        # At the floor there is no gap to have a share of: the quotient would be one of rounding.
+        # At the noise floor there is no gap, and the quotient would be a rounding error.
         if before > floor * 1.001:
             share = (before - max(after, floor)) / (before - floor)
         return float(np.clip(share, WORST, 1.0)) if np.isfinite(share) else None
 
     def share_intervals(self, finding: Finding) -> dict[str, tuple[float, float]]:
-        """Return the 95 % interval of the share of the held-out gap that each effect closes alone,
-        for the effects that were simulated there.
+        """Compute 95 % intervals of the share of the held-out gap that single effects close.
+
+        Args:
+            finding: Outcome of the search, with the simulated held-out runs.
+
+        Returns:
+            Low and high end by effect, for effects that were simulated alone on held-out runs.
         """
         runs, measured = self.measuring, finding.measured
         if runs is None or measured is None:
@@ -334,7 +362,8 @@ class Assessor:
             share = self._share(finding, names)
             if len(names) != 1 or share is None or share <= WORST:
                 continue
-            # A stream of its own: an interval must not depend on what else is resampled.
+            # Each effect has its own random stream, so that its interval does not depend on the
+            # others.
             rng = rng_for("held-out share", *names)
             given = self._counted(), self._floor_of(finding), rng, self._by_stretches
             result = gain(runs, before, simulated.simulated, *given)
@@ -343,12 +372,12 @@ class Assessor:
         return found
 
     def _next(self, search: Search, finding: Finding) -> Experiment | None:
-        """What to record next; None where nothing is open, or nobody waits for it."""
+        """Propose the next experiment; None if nothing is open or the search was stopped early."""
         if finding.cut is not None:
             return None
         if finding.verdict == "unidentifiable":
             return _apart(finding.vague)
-        # The strongest cause that is open first, against its most plausible alternative.
+        # Causes come strongest first, and alternatives most plausible first.
         for cause in finding.causes:
             for other in cause.alternatives:
                 rest = {name for name in finding.model.names if name != cause.effect}
@@ -359,14 +388,14 @@ class Assessor:
 
 
 def _rmse(world: World, simulated: Array, channels: list[int]) -> float:
-    """Error over the channels that count, in their unit."""
+    """Compute the RMS error over the channels that count, in their unit."""
     seen = np.isfinite(world.observed)[..., channels]
     error = (world.observed - simulated)[..., channels][seen]
     return float(np.sqrt(np.square(error).mean()))
 
 
 def _apart(vague: tuple[str, ...]) -> Experiment:
-    """What would fix parameters that the data do not."""
+    """Propose how to identify parameters that the data do not identify."""
     several = len(vague) > 1
     how = "they act differently from each other" if several else "it makes a difference"
     names = " and ".join(vague)
@@ -374,7 +403,7 @@ def _apart(vague: tuple[str, ...]) -> Experiment:
 
 
 def _heldout(found: Gain, unit: str) -> Heldout:
-    """As in the verdict; an interval that the data do not give is None."""
+    """Convert a gain to the form of the verdict; an interval that the data do not give is None."""
     return Heldout(
         finite(found.base),
         finite(found.extended),

@@ -1,4 +1,4 @@
-"""The check before the fit: can *this* recording fix a number, and what is it mixed up with?"""
+"""Identifiability check before a fit: which parameters and causes can a recording identify?"""
 
 from __future__ import annotations
 
@@ -30,17 +30,20 @@ def check(
     free: Sequence[str] = (),
     jobs: int = 1,
 ) -> tuple[Number, ...]:
-    """What a recording can say of every free number, and of every cause.
+    """Assess which free numbers and which causes a recording can identify.
 
     Args:
-        source: the recording.
-        system: take it for this system.
-        model: take it for this robot.
-        free: numbers of a robot's model file, or constants of a system, that are estimated.
-        jobs: processes that work at once.
+        source: Recording, or the path of its table.
+        system: Name of the system to use instead of the one in the description.
+        model: Model file of a robot to use instead of the one in the description.
+        free: Numbers of a robot's model file, or constants of a system, that are estimated.
+        jobs: Number of worker processes.
+
+    Returns:
+        Identifiability of each free number, then of each cause.
 
     Raises:
-        InputError: it cannot be read, or is of nothing that takes effects.
+        InputError: The recording cannot be read, or its simulator takes no effects.
     """
     recording, kind = load(source, system, model, free)
     if not issubclass(kind, Simulated):

@@ -1,9 +1,9 @@
 """Cross-validation over runs: refit each model without one run, and predict that run.
 
 Leave-one-out cross-validation with a run as the unit (M. Stone, J. R. Stat. Soc. B 36(2), 111,
-1974, doi:10.1111/j.2517-6161.1974.tb00994.x), since samples of one run depend on each other. It
-replaces held-out runs where a recording has too few runs to spare one: the model that is reported
-is fitted to all runs, and its error is measured on predictions of runs that no fit has seen.
+1974, doi:10.1111/j.2517-6161.1974.tb00994.x), because samples of one run depend on each other. It
+replaces held-out runs where a recording has too few runs to spare one: the reported model is fitted
+to all runs, and its error is measured on predictions of runs that were not used in the fit.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ from sims.base import Array
 MAX_STEPS = 8
 """Maximum number of Levenberg-Marquardt steps of a refit, which starts from the fit to all runs."""
 SHOWN = 1.0
-"""Change of a fold's runs, as the norm of all samples in standard deviations of the noise, below
-which these runs do not show an effect.
+"""Minimum change of a fold's runs, as the norm over all samples in noise standard deviations, for
+an effect to be supported by these runs.
 """
 
 
 class CrossValidation:
-    """Predict each run with models that are refitted to the other runs.
+    """Validation that predicts each run with models that are refitted to the other runs.
 
     Args:
-        world: all runs, each with the number of its fold.
-        noise: weighs the channels.
+        world: Run evaluator of all runs; each run has the number of its fold.
+        noise: Noise that weights the channels.
 
     Attributes:
-        world, noise: as given.
-        seen: (R, T, C) samples that exist.
+        world: Run evaluator of all runs.
+        noise: Noise that weights the channels.
+        seen: (R, T, C) mask of the available samples.
     """
 
     is_cross_validation = True
@@ -56,7 +57,7 @@ class CrossValidation:
         return sum(fold.fitting.simulations + fold.left_out.simulations for fold in self._folds)
 
     def close(self) -> None:
-        """Release what the simulators of the folds hold; the world of all runs stays open."""
+        """Close the simulators of the folds; the run evaluator of all runs stays open."""
         if "_folds" in self.__dict__:
             for fold in self._folds:
                 fold.fitting.close()
@@ -65,11 +66,14 @@ class CrossValidation:
     def validate(self, fits: Sequence[Fit]) -> list[Measured]:
         """Predict each run with every model, refitted to the other runs.
 
-        Initial states of the predicted run are estimated from it, nothing else. An effect that the
-        other runs do not show is switched off for the prediction: they cannot support it.
+        Only the initial states of the predicted run are estimated from it. An effect that the other
+        runs do not support is switched off for the prediction.
 
         Args:
-            fits: models as fitted to all runs.
+            fits: Models as fitted to all runs.
+
+        Returns:
+            Predictions of all runs by each model.
         """
         shape = self.world.observed.shape
         simulated = np.full((len(fits), *shape), np.nan)
@@ -95,7 +99,7 @@ class CrossValidation:
 
     @cached_property
     def _folds(self) -> list[_Fold]:
-        """The folds; each simulates its own runs, with the parameters of the world of all runs."""
+        """The folds; each has run evaluators for its own runs, with the parameters of the whole."""
         numbers = np.array([run.fold for run in self.world.runs])
         folds = []
         for number in sorted(set(numbers.tolist())):
@@ -105,21 +109,21 @@ class CrossValidation:
         return folds
 
     def _of_runs(self, rows: Indices) -> World:
-        """A world of some of the runs."""
+        """Make a run evaluator of a subset of the runs."""
         world = self.world.over([self.world.runs[row] for row in rows])
         length = world.observed.shape[1]
         if self.world.correction is not None:
             world.correction = self.world.correction[rows, :length]
         if self.world.derivatives is not None:
             world.derivatives = self.world.derivatives[rows, :length]
-        # Workers that are started for one fold know the others, too.
+        # Workers that are started for one fold also know the other folds.
         world.crew.join(world)
         return world
 
     def _refitted(self, fold: _Fold, fits: Sequence[Fit]) -> list[Array]:
-        """Parameters (P,) of each model, refitted to the runs that a fold keeps."""
+        """Refit each model to the runs that a fold keeps, and return its parameters (P,)."""
         base = set(self.world.base.tolist())
-        # All models of a search leave the same parameters at their nominal values.
+        # All models of a search keep the same parameters fixed at their nominal values.
         frozen = frozenset(base - set(fits[0].free.tolist()))
         length = fold.fitting.observed.shape[1]
         starts = []
@@ -131,7 +135,7 @@ class CrossValidation:
         return self._without_unsupported(fold.fitting, refits)
 
     def _without_unsupported(self, world: World, fits: Sequence[Fit]) -> list[Array]:
-        """Parameters (P,) of each model, effects that the runs of a world do not show set to 0."""
+        """Return parameters (P,) of each model, with unsupported effects set to zero."""
         thetas = [fit.theta.copy() for fit in fits]
         trials = [(i, name) for i, fit in enumerate(fits) for name in fit.effects]
         if not trials:
@@ -148,7 +152,7 @@ class CrossValidation:
         seen = np.isfinite(world.observed)
         for (i, name), simulated in zip(trials, without, strict=True):
             change = ((fits[i].simulated - simulated) / self.noise.sigma)[seen]
-            # A motion that cannot be simulated without the effect shows it: NaN is not below.
+            # If the simulation fails without the effect, the change is NaN and the effect is kept.
             if np.linalg.norm(change) < SHOWN:
                 thetas[i][world.places(name)] = 0.0
         return thetas
@@ -156,13 +160,13 @@ class CrossValidation:
 
 @dataclass(frozen=True)
 class _Fold:
-    """A part of the runs that is left out of the fits, and predicted.
+    """Fold: the runs that are left out of the fits and predicted, and the runs that are fitted.
 
     Attributes:
-        rows: numbers of the runs that are left out.
-        others: numbers of the runs that are fitted.
-        fitting: simulates these.
-        left_out: simulates those that are left out.
+        rows: Indices of the runs that are left out.
+        others: Indices of the runs that are fitted.
+        fitting: Run evaluator of the fitted runs.
+        left_out: Run evaluator of the runs that are left out.
     """
 
     rows: Indices

@@ -1,7 +1,8 @@
-"""The next recording: commands by which what is open would be settled.
+"""Design of the next recording: commands that decide what the present recording leaves open.
 
-Runs that an experimenter could make (`rig.plans`), within what the rig may do (`rig.limits`), are
-simulated and ranked by what they tell (`rig.worth`); the best are varied, one thing at a time.
+Runs that an experimenter could make (`rig.plans`), within the limits of the rig (`rig.limits`), are
+simulated and ranked by their value (`rig.worth`). The best plans are then varied, one property at a
+time.
 """
 
 from __future__ import annotations
@@ -18,29 +19,29 @@ from bench.gap.rig.worth import SPLITS, Judge, Worth, by_worth
 from sims.base import Array
 
 ROUNDS = 2
-"""Times that the best plans are varied, while one does not settle it."""
+"""Maximum number of rounds in which the best plans are varied."""
 VARIED = 2
-"""Plans that are varied each time."""
+"""Number of plans that are varied in each round."""
 LENGTHENED = 8
-"""Plans of which it is asked what longer runs would be worth."""
+"""Maximum number of plans that are also tested with a longer run."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """What to record next.
+    """Design of the next recording.
 
     Attributes:
-        says: the commands, in words.
-        by: ``T`` where it tells models apart, ``D`` where it narrows numbers.
-        gain: (2) there, the logarithm of the factor by which the volume of the intervals
-            shrinks; of ``T`` the least of `told`.
-        effect: what stands, if it is to be told from others.
-        told: (1) of `rig.worth` of each other effect that would explain the same; empty for ``D``.
-        times: (T,) seconds.
-        inputs: (T,) by name, each value held until the next.
-        initial: states to begin from, by name.
-        constants: known numbers of the run that are to differ from the first run's, by name.
-        groups: the effects by what would still not be told from each other afterwards.
+        says: Commands in words.
+        by: Criterion: ``T`` if the run distinguishes models, ``D`` if it narrows parameters.
+        gain: For ``D``, (2) of `rig.worth`, the logarithm of the factor by which the volume of the
+            confidence region shrinks; for ``T``, the smallest value of `told`.
+        effect: Effect of the present model that is to be distinguished; empty for ``D``.
+        told: Discrimination, (1) of `rig.worth`, from each alternative effect; empty for ``D``.
+        times: (T,) sample times in seconds.
+        inputs: (T,) values by input, each held until the next sample.
+        initial: Initial states by name.
+        constants: Constants of the run that differ from those of the first run, by name.
+        groups: Effects grouped by those that the run would still not distinguish.
     """
 
     says: str
@@ -56,16 +57,16 @@ class Design:
 
     @property
     def split(self) -> tuple[str, ...]:
-        """Other effects that would be told from what stands."""
+        """Alternative effects that the run would distinguish from the present effect."""
         return tuple(name for name, value in self.told.items() if value > SPLITS)
 
     @property
     def settles(self) -> bool:
-        """Whether nothing would be open afterwards, whatever is true."""
+        """Return whether the run would distinguish all effects, whichever is true."""
         return len(self.groups) == len(self.told) + 1
 
     def document(self) -> dict[str, Any]:
-        """For programs, without the commands themselves, which are a table."""
+        """Return the design as JSON data; the command signals are written as a table instead."""
         return {
             "says": self.says,
             "by": self.by,
@@ -85,14 +86,17 @@ class Design:
 def design(
     models: Models, model: Model, rivals: Sequence[Model], seconds: float, longest: float
 ) -> Design | None:
-    """The best run that could be recorded next; None where none can be simulated.
+    """Design the best run that could be recorded next.
 
     Args:
-        models: among which all of them are.
-        model: the one that stands.
-        rivals: what would explain the same; none where nothing is open.
-        seconds: how long the run is to last.
-        longest: how long it may last where that many seconds do not settle it.
+        models: Collection that contains all of the models.
+        model: Model of the present diagnosis.
+        rivals: Competing models that explain the data as well; empty if there are none.
+        seconds: Duration of the run in seconds.
+        longest: Maximum duration in seconds, if a run of `seconds` does not decide.
+
+    Returns:
+        The design; None if no run can be simulated.
     """
     rig = Rig(models.world, seconds)
     judge = Judge(models, [model, *rivals])
@@ -115,14 +119,17 @@ def design(
 
 
 def _longer_would(best: Worth, times: float) -> bool:
-    """Whether a run so many times as long may tell what the best one does not."""
+    """Return whether a longer run may distinguish models that the best run does not."""
     least = np.minimum(best.values, best.values.T)
     untold = least[(least > 0) & (least <= SPLITS)]
     return times > 1.0 and best.values.ndim == 2 and bool((untold * 2.0 * times > SPLITS).any())
 
 
 def _asked_in_full(judge: Judge, found: Sequence[Worth]) -> list[Worth]:
-    """Runs, the best first, of which the first few are asked in full: first steps flatter."""
+    """Sort runs by value, after exact evaluation of the first ones.
+
+    Linearised values tend to be too high.
+    """
     ranked = sorted(found, key=by_worth)
     for _ in range(judge.patience):
         first = next((k for k, entry in enumerate(ranked[:VARIED]) if not entry.full), None)
@@ -130,12 +137,12 @@ def _asked_in_full(judge: Judge, found: Sequence[Worth]) -> list[Worth]:
             break
         ranked[first] = judge.fitted(ranked[first])
         ranked.sort(key=by_worth)
-    # What nobody has asked in full stands behind what has been.
+    # Runs that are evaluated exactly come before those that are only linearised.
     return sorted(ranked, key=lambda entry: (not entry.full, *by_worth(entry)))
 
 
 def _made(models: Models, among: Sequence[Model], rig: Rig, entry: Worth) -> Design:
-    """The best run as what is to be recorded."""
+    """Build the design from the best run."""
     run, rivals = entry.run, among[1:]
     told: dict[str, float] = {}
     groups: tuple[tuple[str, ...], ...] = ()
@@ -164,12 +171,12 @@ def _made(models: Models, among: Sequence[Model], rig: Rig, entry: Worth) -> Des
 
 
 def _other(model: Model, than: Model) -> str:
-    """The effect that a model has and the other has not."""
+    """Return the effects that one model has and the other does not have."""
     return " and ".join(name for name in model.names if name not in than.names)
 
 
 def _groups(names: Sequence[str], least: Array) -> Iterator[tuple[str, ...]]:
-    """Names that hang together by pairs that are not told apart, in their order."""
+    """Yield connected groups of names that are linked by pairs that are not distinguished."""
     left = list(range(len(names)))
     while left:
         group, new = [], [left[0]]

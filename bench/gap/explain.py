@@ -1,6 +1,4 @@
-"""`simgap explain`: a recording in, a verdict, an extended simulator and a report out. The four
-steps in order.
-"""
+"""Run a diagnosis (`simgap explain`): from a recording to verdict, simulator and report."""
 
 from __future__ import annotations
 
@@ -66,21 +64,21 @@ SOFT_FRICTION = (
     "dry friction has MuJoCo's soft form (solreffriction and solimpfriction of the model file): "
     "it fits better than stiff friction"
 )
-"""Message to the user where the form of dry friction changes."""
+"""Message to the user when dry friction changes to the soft form."""
 STIFF_FRICTION = "soft dry friction leaves a gap all the same: stiff friction is used"
-"""Message to the user where it changes back."""
+"""Message to the user when dry friction changes back to the stiff form."""
 if TYPE_CHECKING:
     from bench.gap.model.numerics import Finer
     from bench.gap.prediction_error.candidate_responses import FollowedRuns
 
 LEAST = 2.0
-"""Samples for each unknown without which nothing can be said."""
+"""Minimum number of samples for fitting per unknown."""
 SPARE = 4
-"""Samples that there must be besides."""
+"""Minimum number of samples for fitting in addition to `LEAST` per unknown."""
 HUGE = 1e9
-"""Values so many times a channel's typical size are none."""
+"""Recorded values of at least this multiple of a channel's typical size are refused."""
 EXPLAINED = ("adequate", "named", "ambiguous")
-"""Verdicts that leave no more than noise."""
+"""Verdicts for which the model explains the data down to the noise."""
 Say = Callable[[str], None]
 Source: TypeAlias = str | Path | Recording
 
@@ -104,25 +102,30 @@ def explain(
     """Explain a recording.
 
     Args:
-        recording: the path of the table, or a recording that is in memory; of several, their runs
-            are explained together.
-        system: take it for this system, whatever the description says.
-        engine: pybullet, mujoco or batch; a simulator that steps itself has its own.
-        seed: of the surrogates and the bootstrap.
-        free: constants to estimate with the parameters.
-        tuner: a registered tuner that finds where the fit of the base parameters begins.
-        say: told what the user should know of the recording and of the base model.
-        force: whether the user insists on a recording that is refused otherwise.
-        watch: says when the search has to end, and is told how far it is.
-        jobs: processes that work at once; the answer does not depend on it.
-        model: take it for this robot, whatever the description says: a model file.
-        whole: look at all of a long recording of a robot, not at pieces of it.
-        pieces: seconds of the pieces that runs are cut into; None where they are not.
-        thorough: search on where causes are left over, with the held-out runs as judges.
+        recording: Path of the table, or a recording in memory; the runs of several recordings are
+            explained together.
+        system: Name of the system to use instead of the one in the description.
+        engine: pybullet, mujoco or batch; a simulator with its own integrator uses that.
+        seed: Random seed of the surrogates and the bootstrap.
+        free: Constants of a system, or numbers of a robot's model file, to estimate with the
+            parameters.
+        tuner: Registered tuner that finds the starting values for the fit of the base parameters.
+        say: Callback for messages to the user about the recording and the base model.
+        force: Explain recordings that are otherwise refused.
+        watch: Search control with the time limit and the progress; by default without limit.
+        jobs: Number of worker processes; the result does not depend on it.
+        model: Model file of a robot to use instead of the one in the description.
+        whole: Use all of a long recording of a robot, not segments of it.
+        pieces: Duration in seconds of the segments that runs are cut into; None for an automatic
+            choice.
+        thorough: Continue the search while causes may be missing, and let held-out runs decide.
+
+    Returns:
+        Verdict, report data and extended simulator.
 
     Raises:
-        InputError: the recording cannot be read, is too short, or is of nothing that takes effects;
-            or the search was ended before anything could be simulated.
+        InputError: The recording cannot be read or is too short, its simulator takes no effects, or
+            the search was stopped before anything could be simulated.
     """
     with closing(Crew(jobs)) as crew:
         sources = [recording] if isinstance(recording, Source) else list(recording)
@@ -134,7 +137,7 @@ def explain(
 
 
 def _added_noise(channels: Sequence[str]) -> str:
-    """What is to be said of channels to which noise was added; empty where there are none."""
+    """Return the message about channels to which noise was added; empty if there are none."""
     if not channels:
         return ""
     return (
@@ -144,7 +147,7 @@ def _added_noise(channels: Sequence[str]) -> str:
 
 
 class Proposed(NamedTuple):
-    """An explanation, and the recording that would say more; None where no run would."""
+    """Explanation, and the recording to make next; None if no run would add information."""
 
     explanation: Explanation
     design: Design | None
@@ -161,8 +164,18 @@ def explain_and_design(
     watch: Watch | None = None,
     jobs: int = 1,
 ) -> Proposed:
-    """Explain recordings, and design the next one, of so many seconds, or up to `longest` where
-    these do not settle it; the other arguments are those of `explain`.
+    """Explain recordings, and design the next recording.
+
+    Args:
+        recording: See `explain`.
+        seconds: Duration in seconds of the next recording.
+        longest: Maximum duration in seconds, if `seconds` do not suffice.
+        system: See `explain`.
+        model: See `explain`.
+        free: See `explain`.
+        say: See `explain`.
+        watch: See `explain`.
+        jobs: See `explain`.
     """
     with closing(Crew(jobs)) as crew:
         sources = [recording] if isinstance(recording, Source) else list(recording)
@@ -175,19 +188,17 @@ def explain_and_design(
 
 
 def _without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
-    """Switch off or leave out what a robot's drives do nothing about."""
+    """Switch off or leave out the samples of a robot in which its drives have no effect."""
     if not kind.has_model:
         return recording
-    # Loaded where there is a robot alone.
+    # This import is needed for robots only.
     from bench.gap.prediction_error.inactive_drives import without_inactive_drives
 
     return without_inactive_drives(recording, kind)
 
 
 class _Subject(NamedTuple):
-    """What is explained: a recording, what it is taken for if not for what it says, and whether all
-    of it is looked at.
-    """
+    """Recordings to explain, what to use instead of their descriptions, and their segmentation."""
 
     sources: Sequence[Source]
     system: str | None
@@ -197,7 +208,7 @@ class _Subject(NamedTuple):
 
 
 class _Worlds(NamedTuple):
-    """A simulator with one step, and its runs for fitting and for measuring."""
+    """Simulator with one time step, and its run evaluators for fitting and validation."""
 
     kind: type[Simulated]
     fitting: World
@@ -205,7 +216,7 @@ class _Worlds(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """An answer: the base model, the search from it, what that found, and its random numbers."""
+    """Search result: base model, search, finding and random generator."""
 
     base: Base
     search: Search
@@ -237,14 +248,15 @@ class _Explainer:
         self.path = self.recording.path
         if not issubclass(kind, Simulated):
             raise self._takes_no_effects()
-        # The effects that it holds already could not be chosen again.
+        # Effects that are part of the simulator already could not be chosen again.
         extend.refuse_extended(kind)
-        # A simulator that steps itself has no engine to choose.
+        # A simulator with its own integrator has no choice of engine.
         usual = kind.default_engine if kind.has_model else None
         self.engine = usual if kind.own_engine else engine
-        # What is free of a robot is a number of its file, and a parameter of its simulator.
+        # A free number of a robot is a number of its model file, and so a parameter of its
+        # simulator.
         free = () if kind.has_model else free
-        # Before the worlds, which plan every step of every run.
+        # This check precedes the run evaluators, which plan every step of every run.
         for odd in refuse_odd(self.recording, kind, force):
             say(f"{self.path}: {odd}")
         self.recording, thinned = thin(self.recording, kind)
@@ -263,9 +275,9 @@ class _Explainer:
         self.crew = crew
         self.thorough = thorough
         self.free = tuple(free)
-        # By name the declared range of a base parameter and the wider one that it was given.
+        # By name, the declared range of a base parameter and the wider range that replaced it.
         self.wider: dict[str, tuple[Bounds, Bounds]] = {}
-        # Base parameters of a robot that prediction errors give, where the fit begins.
+        # Base parameters of a robot, identified by prediction errors; starting values of the fit.
         self.identified: Array | None = None
         self._enter(kind)
         left_out = [
@@ -275,7 +287,7 @@ class _Explainer:
             say(line)
         self.notes = (*self.notes, *left_out)
         self.coarse: Coarse | None = None
-        # Finer steps that differ from the file's, and the worlds of the file's where one is used.
+        # Finer steps than the file's, and the run evaluators with the file's step if one is used.
         self.finer: Reusable[Finer] | None = None
         self.file = _Worlds(self.kind, self.fitting, self.validation)
         self.found: tuple[Search, Finding] | None = None
@@ -283,35 +295,35 @@ class _Explainer:
         self._check()
 
     def _enter(self, kind: type[Simulated]) -> None:
-        """Take the recording for one of this simulator."""
+        """Set up run evaluators, noise floor and validation for a simulator class."""
         before = self._followed()
         self.fitting = self._world(kind, self.recording.training())
         self.floor: Floor = noise_floor(self.fitting, self.recording)
-        # White to begin with: each likelihood finds the memory of the noise for itself.
+        # The noise is white at first: each likelihood estimates its autocorrelation.
         self.noise = Noise(self.floor.sigma, np.zeros(len(self.floor.sigma)))
         self.kind = kind
         self.validation = self._validation(kind)
         self.assessor = self._assessor()
         for known, world in zip(before, self._worlds(), strict=False):
-            # Where the runs begin depends little on how they are stepped.
+            # The initial states of the runs depend little on the time step.
             world.follow(known)
 
     def _worlds(self) -> list[World]:
-        """The runs for fitting, and those held out."""
+        """Return the run evaluators of the runs for fitting and of the held-out runs."""
         validation = self.validation
         held_out = validation.world if isinstance(validation, HeldOutRuns) else None
         return [self.fitting] if held_out is None else [self.fitting, held_out]
 
     def _followed(self) -> list[FollowedRuns]:
-        """Runs of a robot as a filter follows them, if it does."""
+        """Return the filtered runs of a robot, if there are any."""
         if not hasattr(self, "fitting"):
             return []
         return [w.followed for w in self._worlds() if w.followed is not None]
 
     def _validation(self, kind: type[Simulated]) -> Validation | None:
-        """Prepare the validation: on held-out runs, else by cross-validation of few runs."""
+        """Prepare the validation: on held-out runs, or by cross-validation of few runs."""
         if held_out := self.recording.held_out():
-            # The same effects in the same places, so that a fitted vector means the same there.
+            # The same effects at the same indices give a parameter vector the same meaning here.
             return HeldOutRuns(self._world(kind, held_out), self.noise)
         if len(self.recording.folds()) > 1:
             return CrossValidation(self.fitting, self.noise)
@@ -338,7 +350,7 @@ class _Explainer:
 
     def _check(self) -> None:
         world = self.fitting
-        # Fewer samples than unknowns are followed exactly, whatever the model: no gap would show.
+        # With fewer samples than unknowns every model fits exactly, and no gap would be visible.
         samples = int(np.isfinite(world.observed).sum())
         unknowns = world.base.size + int((~world.known).sum())
         if samples < LEAST * unknowns + SPARE:
@@ -347,7 +359,8 @@ class _Explainer:
                 f"{self.path}: too short: {samples} samples for fitting, "
                 f"expected at least {least} for {unknowns} parameters and initial states"
             )
-        # What is larger by so many orders is of a wrong unit, and nothing that a fit could follow.
+        # Values that are too large by orders of magnitude have a wrong unit; no fit could follow
+        # them.
         measuring = self.assessor.measuring
         parts = [part.observed for part in (world, measuring) if part is not None]
         for c, channel in enumerate(world.simulator.channels):
@@ -358,7 +371,7 @@ class _Explainer:
                     f"{channel.scale:g} {channel.unit}, found {largest:.3g}; is the unit right?"
                 )
 
-    # Small products: with a thread for each core they take five times as long where others compute.
+    # With a thread per core, small matrix products take five times as long on a busy machine.
     @one_thread()
     def run(self) -> Explanation:
         self._refuse_broken_conventions()
@@ -382,13 +395,13 @@ class _Explainer:
         return Explanation(verdict, story, self._extended(search, finding))
 
     def _searched(self, base: Base) -> _Found:
-        """Search and judge; again with MuJoCo's soft dry friction where the data show it."""
-        # One stream for surrogates and bootstrap: the same seed tells the same story.
+        """Search and judge; repeat with MuJoCo's soft dry friction if the data support it."""
+        # Surrogates and bootstrap share one random stream, so that a seed gives the same result.
         rng = self._rng()
         search = self._search(base, rng)
         if not self.kind.has_model:
             return _Found(base, search, self._finding(search), rng)
-        # Loaded where there is a robot alone.
+        # This import is needed for robots only.
         from bench.gap.prediction_error.dry_friction import SoftFrictionError
 
         stiff = _Worlds(self.kind, self.fitting, self.validation)
@@ -417,11 +430,11 @@ class _Explainer:
         """Refuse a robot's recording whose conventions differ from those of its model file.
 
         Raises:
-            InputError: they do; the message says what to change.
+            InputError: The conventions differ; the message names the change to make.
         """
         if not self.kind.has_model or self.force:
             return
-        # Loaded where there is a robot alone.
+        # These imports are needed for robots only.
         from bench.gap.conventions.comparison import ConventionComparison
         from bench.gap.conventions.corrected_description import lines_of
 
@@ -445,18 +458,18 @@ class _Explainer:
 
     @staticmethod
     def _is_explained(found: _Found) -> bool:
-        """Whether an answer leaves no more than noise."""
+        """Return whether a result explains the data down to the noise."""
         return found.finding.verdict in EXPLAINED
 
     def _searched_soft(self, base: Base, before: Search, likely: Start | None = None) -> _Found:
         """Search and judge with MuJoCo's soft dry friction.
 
         Args:
-            base: the base model.
-            before: the search with stiff friction.
-            likely: a model that may explain the runs.
+            base: Base model.
+            before: Search with stiff friction.
+            likely: Model that may explain the runs.
         """
-        # Loaded where there is a robot alone.
+        # This import is needed for robots only.
         from bench.gap.prediction_error.search import PredictionErrorSearch
 
         self.say(SOFT_FRICTION)
@@ -477,12 +490,13 @@ class _Explainer:
         return _Found(base, search, self._finding(search), rng)
 
     def _answered(self, base: Base) -> _Found:
-        """The answer from a base model that was fitted with another step."""
+        """Freeze and correct a base model that was fitted with another step, and search again."""
         return self._searched(self._settled(base))
 
     def _finding(self, search: Search) -> Finding:
-        """What the simulator lacks; no cause where the recording states a unit or a sign wrongly,
-        which every cause would only imitate.
+        """Return the finding; without causes if the recording has a wrong unit or sign.
+
+        Every cause would only imitate the wrong unit or sign.
         """
         base = search.base
         if not self.faults:
@@ -493,16 +507,16 @@ class _Explainer:
         return Finding("unknown", base, base, (), remains(search, base))
 
     def _named(self, search: Search) -> Finding:
-        """Answer the questions about a recording; about a robot's by prediction errors."""
+        """Diagnose the causes; for a robot by prediction errors."""
         if self.fitting.followed is None:
             return name(search, self.validation)
-        # Loaded where there is a robot alone.
+        # This import is needed for robots only.
         from bench.gap.prediction_error.confirmation import Confirmation
 
         return answer(Confirmation(search, self.validation))
 
     def _unexplained(self, search: Search, finding: Finding) -> tuple[RecordingFault, ...]:
-        """Wrong units and signs of a robot's recording that no effect explains."""
+        """Return wrong units and signs of a robot's recording that no effect explains."""
         explained = finding.verdict in EXPLAINED
         if not self._asks_units_late or explained or self.watch.left():
             return ()
@@ -511,7 +525,7 @@ class _Explainer:
         return () if fault is None else (fault,)
 
     def _imitated(self, search: Search, finding: Finding) -> tuple[RecordingFault, ...]:
-        """Wrong units and signs that causes stand for."""
+        """Return wrong units and signs that the diagnosed causes imitate."""
         found = [
             recognised(self._units, self.fitting, cause, search.base.fit)
             for cause in self.assessor.causes(search, finding)
@@ -520,18 +534,24 @@ class _Explainer:
 
     @property
     def _units(self) -> Subject:
-        """What the check of units looks at."""
+        """Input of the unit check."""
         return Subject(self.kind, self.recording, self.engine, self.free)
 
     def close(self) -> None:
-        """Let go of what simulates; not earlier, since experiments are proposed by simulating."""
+        """Close the simulators; proposals of experiments need them until then."""
         self.fitting.close()
         if self.validation is not None:
             self.validation.close()
 
     def design(self, seconds: float, longest: float) -> Design | None:
-        """The next recording, after `run`: that which splits the first set of causes that is open,
-        else that which narrows the numbers of what stands.
+        """Design the next recording; call it after `run`.
+
+        The run distinguishes the first cause that has alternatives. If there is none, it narrows
+        the parameters of the present model.
+
+        Args:
+            seconds: Duration of the run in seconds.
+            longest: Maximum duration in seconds, if `seconds` do not suffice.
         """
         if self.found is None:
             return None
@@ -545,10 +565,10 @@ class _Explainer:
         return design(search, finding.model, (), seconds, longest)
 
     def _search(self, base: Base, rng: np.random.Generator, **attributes: Any) -> Search:
-        """Begin a search, by prediction errors where the simulator can be linearised."""
+        """Begin a search; by prediction errors where the simulator can be linearised."""
         kind = Search
         if self.fitting.followed is not None:
-            # Loaded where there is a robot alone.
+            # This import is needed for robots only.
             from bench.gap.prediction_error.search import PredictionErrorSearch
 
             kind = PredictionErrorSearch
@@ -558,8 +578,9 @@ class _Explainer:
         return search
 
     def _base(self) -> Base:
-        """The base model; of a robot with the step that the data ask for, the file's or a finer
-        one.
+        """Fit the base model; for a robot with the time step that the data support.
+
+        This is the step of the model file or a finer one.
         """
         if self.kind.has_model:
             self._follow()
@@ -575,20 +596,21 @@ class _Explainer:
 
     @property
     def _asks_units_late(self) -> bool:
-        """Whether units are questioned where no effect explains the gap, as those of a robot's
-        recording are unless its free numbers could not be identified.
+        """Return whether units are checked only after no effect has explained the gap.
+
+        This is so for a robot's recording, unless its free numbers could not be identified.
         """
         lost = self.free_numbers and self.identified is None and self.fitting.followed is not None
         return self.kind.has_model and not lost
 
     @property
     def free_numbers(self) -> bool:
-        """Whether the base model has parameters."""
+        """Return whether the base model has parameters."""
         return bool(self.fitting.base.size)
 
     def _follow(self) -> None:
-        """Estimate where the runs of a robot begin, by a filter with the model as it stands."""
-        # Loaded where there is a robot alone.
+        """Estimate the initial states of a robot's runs by a filter with the present model."""
+        # This import is needed for robots only.
         from bench.gap.prediction_error.candidate_responses import FollowedRuns
 
         self.watch.stage("following the runs with the model")
@@ -601,14 +623,15 @@ class _Explainer:
             followed = self._identified(followed)
         world.follow(followed)
         for world in held_out:
-            # Held-out runs are simulated alone, and begin at their readings without a filter.
+            # Held-out runs are only simulated; without a filter they begin at their measured
+            # values.
             found = FollowedRuns.follow(world, world.nominal(), self.noise)
             if found.is_sound:
                 world.follow(found)
 
     def _identified(self, followed: FollowedRuns) -> FollowedRuns:
-        """The runs, filtered with base parameters that are identified by prediction errors."""
-        # Loaded where there is a robot alone.
+        """Return the runs, filtered with base parameters from a prediction-error fit."""
+        # This import is needed for robots only.
         from bench.gap.prediction_error.likelihood_fit import identify_base
 
         world = self.fitting
@@ -620,7 +643,7 @@ class _Explainer:
         return found
 
     def _widen(self, found: Mapping[str, Bounds], declared: Mapping[str, Bounds]) -> None:
-        """State the wider ranges of base parameters, and use them for all runs."""
+        """Report the wider ranges of base parameters, and use them for all runs."""
         for world in self._worlds()[1:]:
             use_bounds(world, found)
         for parameter, (low, high) in found.items():
@@ -628,29 +651,31 @@ class _Explainer:
         self.wider |= {one: (declared[one], bounds) for one, bounds in found.items()}
 
     def _prepared(self, base: Base) -> Base:
-        """The base model of a robot with the step that the data ask for, and without free numbers
-        that they cannot fix.
+        """Return the base model of a robot with the step that the data support.
+
+        Free numbers that the data cannot identify are frozen.
         """
         if self._shows_steps(base):
             base = self._stepped(base)
         return self._settled(base)
 
     def _shows_steps(self, base: Base) -> bool:
-        """Whether the recording shows what the engine's steps miss."""
+        """Return whether the recording shows the discretisation error of the engine's steps."""
         lost = self.fitting.followed is None or not np.isfinite(base.fit.cost)
         if self.watch.left() or lost:
             return True
-        # Loaded where there is a robot alone.
+        # These imports are needed for robots only.
         from bench.gap.prediction_error.candidate_responses import FollowedRuns
         from bench.gap.prediction_error.identification import shows_step_errors
 
         return shows_step_errors(FollowedRuns.of_model(self.fitting, base.fit.theta, self.noise))
 
     def _without_step(self, base: Base) -> Base:
-        """The base model without the errors of the engine's steps, where the recording shows them
-        or no filter could tell.
+        """Return the base model without the discretisation error of the engine's steps.
+
+        The error is corrected if the recording shows it, or if no filter could decide.
         """
-        # Loaded where there is a robot alone.
+        # This import is needed for robots only.
         from bench.gap.prediction_error.identification import shows_step_errors
 
         followed = self.fitting.followed
@@ -659,13 +684,13 @@ class _Explainer:
         return without_step(self.fitting, self.noise, base)
 
     def _settled(self, base: Base) -> Base:
-        """The base model of a robot whose step is chosen."""
+        """Widen ranges, freeze unidentified numbers and correct the step error of a base model."""
         base = self._frozen(self._within_range(base))
-        # What is asked about as a cause comes first: it would not be seen afterwards.
+        # The choice of the step precedes this correction, which hides the discretisation error.
         return self._without_step(base)
 
     def _within_range(self, base: Base) -> Base:
-        """The base model with wider ranges for parameters that its fit leaves at a bound."""
+        """Widen the ranges of base parameters that the fit leaves at a bound."""
         declared = {p.name: p.bounds for p in self.fitting.parameters}
         declared |= {name: bounds for name, (bounds, _) in self.wider.items()}
         base, found = fit_wider(self.fitting, self.noise, base)
@@ -673,9 +698,10 @@ class _Explainer:
         return base
 
     def _frozen(self, base: Base) -> Base:
-        """The base model without free numbers of the robot that the data cannot fix.
+        """Freeze free numbers of a robot that the data cannot identify.
 
-        A system has few parameters, and without them nothing is told: there the verdict says so.
+        A system has few parameters, and would have no result without them; there the verdict
+        reports it.
         """
         if self.watch.left() or not np.isfinite(base.fit.cost):
             return base
@@ -686,10 +712,12 @@ class _Explainer:
         return kept
 
     def _stepped(self, base: Base) -> Base:
-        """The base model with the step that closes a large part of its gap alone: the file's own,
-        or a finer one. Its worlds are the explainer's.
+        """Choose the step of the base model: the file's own, or a finer one.
+
+        A finer step is used if it alone closes a large part of the gap. The run evaluators of the
+        chosen step are then those of the explainer.
         """
-        # Loaded where there is a robot alone.
+        # This import is needed for robots only.
         from bench.gap.model.numerics import finer
 
         self.finer = Reusable(finer(self.fitting, self.noise))
@@ -697,17 +725,17 @@ class _Explainer:
         value, left = self._judged(base)
         gap = left - 1.0
         for fine in self.finer:
-            # A finer step leaves less: one that is too coarse for what is left is not tried.
+            # A finer step leaves a smaller residual; a step that is too coarse for it is not tried.
             if not fine.suits(left):
                 continue
             self._enter(fine.kind)
             if self.fitting.followed is None:
-                # A model that diverges with the file's step may be followed with a finer one.
+                # A model that diverges with the file's step may be filtered with a finer one.
                 self._follow()
             other = fit_base(self.fitting, self.noise, self._nearby(base))
             reached, left = self._judged(other)
             if not is_finer_step_better(reached - value, gap, left - 1.0):
-                # Another missing effect may bend either model: both are compared again with it.
+                # Another missing effect may affect both models: they are compared again with it.
                 if fine.suits(0.0):
                     break
                 left = 0.0
@@ -718,19 +746,20 @@ class _Explainer:
         return base
 
     def _use_finer(self, fine: Finer, gain: float, base: Base, file: _Worlds) -> None:
-        """State that the file's own step is at fault; the worlds are those of the finer one."""
+        """Record that the file's own step is too coarse; the finer step is in use already."""
         numerics = fine.numerics
         self.say(f"stepped more finely: {numerics.integrator}, {numerics.timestep:g} s")
         self.coarse, self.file = Coarse(fine, gain), file
         self.assessor = replace(self.assessor, before=self._before(base, file.validation))
 
     def _with_better_step(self, search: Search, finding: Finding) -> _Found | None:
-        """The answer with another step, where that explains the data better with the effects of
-        this answer or with some of them; None where this step stands.
+        """Return the result with another step, if that explains the data better; otherwise None.
+
+        The other step is compared with the effects of this result or some of them.
 
         A missing effect can make either step look better, and effects can imitate a step, so the
-        first choice is preliminary. Models are compared by merit and residual, and a finer step
-        must be clearly better: data that MuJoCo made with the file's own step must
+        first choice is preliminary. Models are compared by penalised log-likelihood and residual,
+        and a finer step must be clearly better: data that MuJoCo made with the file's own step must
         not be explained by another.
         """
         if self.finer is None or self.faults or finding.cut is not None or self.watch.left():
@@ -763,8 +792,10 @@ class _Explainer:
         return self._answered(other)
 
     def _best(self, search: Search, finding: Finding) -> tuple[float, float]:
-        """Merit and excess over the noise of the best model with some or all effects of a finding,
-        fitted with the step of the present worlds.
+        """Fit all subsets of a finding's effects with the present step, and rate the best model.
+
+        Returns:
+            Penalised log-likelihood and excess RMS residual of the best model.
         """
         names, fit = finding.model.names, finding.model.fit
         slots = self.fitting.slots
@@ -781,8 +812,10 @@ class _Explainer:
         return best.merit, models.excess(best)
 
     def _nearby(self, base: Base) -> Array | None:
-        """Where a fit of finer steps begins: a step moves the best parameters a little, and its
-        fit needs no other starts; None where the coarse one has come to nothing.
+        """Return starting values for a fit with another step; None for the default starts.
+
+        A different step changes the best parameters only a little, so the fit needs no other
+        starts, unless the fit with the previous step failed.
         """
         if not np.isfinite(base.fit.cost) or self.identified is not None:
             return self._given()
@@ -796,14 +829,12 @@ class _Explainer:
         return validation.validate([base.fit])[0].simulated
 
     def _return(self, worlds: _Worlds, before: Array | None = None) -> None:
-        """Go back to worlds that were left."""
+        """Return to run evaluators that were in use before."""
         self.kind, self.fitting, self.validation = worlds
         self.assessor = replace(self._assessor(), before=before)
 
     def _judged(self, base: Base) -> tuple[float, float]:
-        """Twice the log likelihood of a base model, and what it leaves, RMS in units of the
-        noise.
-        """
+        """Return twice the log-likelihood and the RMS residual, in noise units, of a base model."""
         found = self._search(base, self._rng())
         return float(found.base.likelihood.value), 1.0 + found.excess(found.base)
 
@@ -811,7 +842,7 @@ class _Explainer:
         return rng_for("explain", self.recording.system, self.seed)
 
     def _fails(self) -> InputError:
-        """Why nothing could be simulated."""
+        """Return the error that explains why nothing could be simulated."""
         if self.faults:
             return InputError(f"{self.path}: {self.faults[0].says}")
         if self.watch.left():
@@ -824,12 +855,13 @@ class _Explainer:
         )
 
     def _given(self) -> Array | None:
-        """Base parameters with which a fit begins: those of a registered tuner, or those that are
-        identified by prediction errors; None where there are none.
+        """Return starting values of the base parameters; None for the default starts.
+
+        They come from a registered tuner, or are those identified by prediction errors.
         """
         if self.tuner is None:
             return self.identified
-        # Loaded here alone: few ask for a tuner, and what drives one is much to load.
+        # Few users request a tuner, and the code that drives one is slow to import.
         from bench.gap.model.tuner_start import tuned
 
         return tuned(self.tuner, self.fitting, self.noise, self.seed)
@@ -837,10 +869,10 @@ class _Explainer:
     def _extended(self, search: Search, finding: Finding) -> Extended:
         world, numbers = self.fitting, self.assessor.numbers(search, finding.model)
         own = {p.name: numbers[i] for i, p in enumerate(world.parameters[: world.own])}
-        # A freed constant is a constant of the extended simulator, with the value that was fitted.
+        # A freed constant becomes a constant of the extended simulator, with its fitted value.
         freed = {p.name: numbers[world.own + i].value for i, p in enumerate(world.freed)}
         added = {}
-        # In the simulator's order, so that the file does not hang on how the search went.
+        # The simulator's order keeps the file independent of the order of the search.
         for effect, slot in world.slots.items():
             if effect not in finding.model.names:
                 continue

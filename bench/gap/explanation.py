@@ -1,4 +1,4 @@
-"""The result of `explain`: to look at in a notebook, to ask for its parts, to write to a folder."""
+"""Result of `explain`: displayed in a notebook, queried for its parts, or written to a folder."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDEST = 160
-"""Characters of a line when the result is shown as text; what is longer is cut."""
+"""Maximum number of characters per line when the result is shown as text; the rest is cut off."""
 
 
 @dataclass(frozen=True, repr=False)
 class Explanation:
-    """The result of `explain`.
+    """Result of `explain`.
 
     Attributes:
-        answer: the verdict with its numbers; ``answer.document()`` is what verdict.json says.
-        story: everything a person is told.
-        extended: the extended simulator.
+        answer: Verdict with its numbers; ``answer.document()`` is the content of verdict.json.
+        story: Data from which text, figures and page of the report are rendered.
+        extended: Extended simulator.
     """
 
     answer: Verdict
@@ -56,43 +56,48 @@ class Explanation:
 
     @property
     def causes(self) -> tuple[Cause, ...]:
-        """What the simulation lacks, strongest first; empty where nothing was found."""
+        """Effects that the simulation lacks, strongest first; empty if nothing was found."""
         return self.answer.causes
 
     @property
     def figures(self) -> tuple[str, ...]:
-        """Names of the figures that there are: ``overview``, ``where``, ``candidates`` at most, and
-        ``robot`` where it is one.
+        """Names of the available figures.
+
+        They are at most ``overview``, ``where``, ``candidates``, and ``robot`` for a robot.
         """
         return pictures.names(self.story)
 
     def figure(self, name: str) -> Figure:
-        """One of the report's figures, made anew.
+        """Draw one of the report's figures.
+
+        Args:
+            name: One of `figures`.
 
         Raises:
-            InputError: there is none of that name.
+            InputError: There is no figure of that name.
         """
         return pictures.figure(self.story, name)
 
     @check_arguments
     def write(self, folder: str | Path, *, pdf: bool = False, ranges: bool = False) -> list[Path]:
-        """Write verdict.json, extended.toml, the figures and report.html: all of them or none. Of
-        several runs also apart.csv, and for a robot extended.xml, and extended.urdf for one from a
-        URDF, after extended.toml.
+        """Write verdict.json, extended.toml, the figures and report.html: all of them or none.
 
-        The folder is made where it is missing; files of these names in it are replaced.
+        For several runs apart.csv is written too, and for a robot extended.xml, and extended.urdf
+        if the robot comes from a URDF; they follow extended.toml.
+
+        A missing folder is created; existing files with these names are replaced.
 
         Args:
-            folder: to write to.
-            pdf: write each figure as PDF too, in addition to PNG.
-            ranges: also write the ranges for domain randomisation (`ranges`), if there are any:
+            folder: Folder to write to.
+            pdf: Also write each figure as PDF, in addition to PNG.
+            ranges: Also write the ranges for domain randomisation (`ranges`), if there are any:
                 ranges.toml, ranges.csv, ranges_isaac_lab.py and ranges_mujoco_playground.py.
 
         Returns:
             The files in the order above, each figure as PNG before PDF.
 
         Raises:
-            InputError: the folder cannot be made or written to.
+            InputError: The folder cannot be created or written to.
         """
         folder = Path(folder)
         with pdf_figures(pdf):
@@ -105,7 +110,7 @@ class Explanation:
             contents[folder / "apart.csv"] = csv_text(HEAD, apart)
         contents |= {folder / name: text for name, text in self._robot_files.contents.items()}
         if ranges:
-            # Loaded for those who ask alone.
+            # This import is needed only if ranges are requested.
             from bench.gap.randomization.files import range_files
 
             found = range_files(self.ranges, self.extended, folder)
@@ -115,7 +120,8 @@ class Explanation:
             if figure.pdf is not None:
                 contents[folder / f"{name}.pdf"] = figure.pdf
         contents[folder / "report.html"] = page(self._told, figures, folder)
-        # All is drawn before the first file is made: what fails until here leaves no trace.
+        # Everything is rendered before the first file is written: an earlier failure leaves no
+        # files.
         try:
             folder.mkdir(parents=True, exist_ok=True)
             write_all(contents)
@@ -125,14 +131,16 @@ class Explanation:
 
     @cached_property
     def ranges(self) -> RandomizationRanges:
-        """The ranges for domain randomisation: of each fitted number of a robot's named causes, and
-        of each free number, the 95 % interval of what the model file then has.
+        """Ranges for domain randomisation.
+
+        They contain, for each fitted number of a robot's diagnosed causes and for each free number,
+        the 95 % interval of the resulting value in the model file.
         """
         return randomization_ranges(self.answer, self.extended)
 
     @property
     def unsaid(self) -> tuple[str, ...]:
-        """Of a robot: what its own file cannot say, and what is to be known of what it says."""
+        """For a robot: what its model file cannot express, and notes on what was written to it."""
         return self._robot_files.said
 
     @cached_property
@@ -141,7 +149,7 @@ class Explanation:
 
     @cached_property
     def _told(self) -> Story:
-        """The story, with what is to change in a robot's model file."""
+        """Report data with the changes of a robot's model file."""
         files = self._robot_files
         if not files.contents:
             return replace(self.story, unwritten=files.said)
@@ -153,14 +161,14 @@ class Explanation:
     def __repr__(self) -> str:
         lines = [f"{self.verdict}: {self.story.title}", self._causes_in_words(), self._gain()]
         lines.append(cut(self.story))
-        # Titles and names are from files: a long one must not fill the cell.
+        # Titles and names come from files; a long one must not fill the cell.
         return "\n".join(clean(line, WIDEST) for line in lines if line)
 
     def _causes_in_words(self) -> str:
         return "; ".join(_in_words(cause) for cause in self.causes)
 
     def _gain(self) -> str:
-        """The share of the gap that is closed; empty where nothing was found or measured."""
+        """Return the share of the gap that is closed; empty if nothing was found or measured."""
         held_out = self.story.verdict.heldout
         if not self.causes or held_out is None or not closes(held_out):
             return ""
@@ -168,13 +176,17 @@ class Explanation:
         return f"{share} of the gap closed{interval(held_out)} on {self.story.validation_runs}"
 
     def _repr_html_(self) -> str:
-        """The report for a notebook's cell, in a frame of its own so that its styles stay there."""
-        # Nothing lies beside a cell: no file is named.
+        """Return the report in a frame for a notebook cell, so that its styles stay inside."""
+        # A cell has no folder with files, so none is linked.
         return framed(page(self._told, pictures.printed(self.story)))
 
 
 def _in_words(cause: Cause) -> str:
-    """``drag.linear or friction.coulomb: coefficient 2.2×10⁻⁴ (2.0×10⁻⁴ to 2.4×10⁻⁴) N·s/m``."""
+    """Format a cause, its alternatives and its numbers.
+
+    For example ``drag.linear or friction.coulomb: coefficient 2.2×10⁻⁴ (2.0×10⁻⁴ to 2.4×10⁻⁴)
+    N·s/m``.
+    """
     effects = joined([cause.effect, *cause.alternatives], "or")
     numbers = [f"{name} {estimated(number)}" for name, number in cause.coefficients.items()]
     return f"{effects}: {joined(numbers)}"

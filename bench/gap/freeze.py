@@ -1,9 +1,8 @@
-"""Numbers of a robot that a user left free and that a recording cannot fix: they are frozen, not
-fitted.
+"""Freeze free numbers of a robot that the recording cannot identify.
 
-What cannot be fixed beside the others would take any value, and every other number with it. One is
-frozen after another, the widest against its range first, since a second one that was mixed up with
-it may be fixed then.
+A number that cannot be identified together with the others could take any value and would change
+all other numbers. Numbers are frozen step by step, those with the largest standard error relative
+to their range first, because a confounded number may then become identifiable.
 """
 
 from __future__ import annotations
@@ -19,17 +18,20 @@ from bench.gap.model.noise import Noise
 from bench.gap.model.world import World
 
 AGAIN = 4
-"""Times a fit is made again with more numbers frozen; the last time all of them at once."""
+"""Maximum number of refits with more frozen numbers; the last one freezes all remaining ones."""
 
 
 def frozen(world: World, noise: Noise, base: Base, searching: Callable[[Base], Search]) -> Base:
-    """The base model with every free number at its nominal value that the data cannot fix.
+    """Freeze at the nominal value all free numbers that the data cannot identify.
 
     Args:
-        world: the runs.
-        noise: of each channel.
-        base: the fitted base model.
-        searching: a search from a base model, which knows its covariance.
+        world: Run evaluator of the runs.
+        noise: Noise of each channel.
+        base: Fitted base model.
+        searching: Function that begins a search from a base model, which gives its covariance.
+
+    Returns:
+        The base model, fitted without these numbers.
     """
     for turn in range(AGAIN):
         search = searching(base)
@@ -37,7 +39,7 @@ def frozen(world: World, noise: Noise, base: Base, searching: Callable[[Base], S
         places = [i for i in world.base.tolist() if world.parameters[i].name in wide]
         if not places:
             break
-        # They come in the order of how wide they are.
+        # `wide` is sorted by the width of the intervals.
         places.sort(key=lambda i: wide.index(world.parameters[i].name))
         some = places if turn == AGAIN - 1 else places[: (len(places) + 1) // 2]
         theta = base.fit.theta.copy()

@@ -1,8 +1,10 @@
-"""The form of a robot's dry friction: stiff, which is Coulomb friction, or soft, which is what
-MuJoCo makes of `frictionloss` with the solver parameters of the model file.
+"""Form of a robot's dry friction: stiff or soft.
 
-A simulator adds all dry friction in one form, so a form is compared by fitting the same effects in
-a world of the other form.
+Stiff is Coulomb friction. Soft is the friction that MuJoCo computes from `frictionloss` with the
+solver parameters of the model file.
+
+A simulator adds all dry friction in one form. A form is therefore compared by fitting the same
+effects with a run evaluator of the other form.
 """
 
 from __future__ import annotations
@@ -19,19 +21,25 @@ from sims.simulated import Simulated
 from sims.system import Effect, Friction, members_of
 
 _HOLDS = ", and holds still what pulls less"
-"""What the sentence of Coulomb friction says that is not true of the soft form, which creeps."""
+"""Part of the description of Coulomb friction that does not hold for the soft form, which creeps.
+"""
 
 
 def soft_kind(kind: type[Simulated]) -> type[Simulated]:
-    """The simulator's class of a robot, with dry friction in MuJoCo's soft form."""
+    """Return the simulator class of a robot with dry friction in MuJoCo's soft form."""
     robot: Any = kind
     soft: type[Simulated] = robot.with_friction_form("soft")
     return soft
 
 
 def has_dry_friction(world: World, names: Iterable[str]) -> bool:
-    """Whether these effects of a robot, or freed numbers of its file, contain dry friction, so that
-    its form matters.
+    """Return whether effects or freed numbers of a robot contain dry friction.
+
+    Only then the form of dry friction matters.
+
+    Args:
+        world: Run evaluator; its simulator may be a robot.
+        names: Names of effects.
     """
     robot: Any = world.kind
     if not robot.has_model:
@@ -43,20 +51,31 @@ def has_dry_friction(world: World, names: Iterable[str]) -> bool:
 
 
 def has_soft_form(world: World) -> bool:
-    """Whether the effects of a robot add dry friction in MuJoCo's soft form."""
+    """Return whether the effects of a robot add dry friction in MuJoCo's soft form."""
     robot: Any = world.kind
     return bool(robot.has_model and robot.robot.friction_form == "soft")
 
 
 def form_of(world: World, name: str) -> str | None:
-    """``soft`` where an effect is dry friction in MuJoCo's soft form; None for all others."""
+    """Return ``soft`` for dry friction in MuJoCo's soft form, and None for other effects.
+
+    Args:
+        world: Run evaluator with the effect.
+        name: Name of the effect.
+    """
     is_soft = has_soft_form(world) and _is_dry_friction(type(world.effects[name]))
     return "soft" if is_soft else None
 
 
 def with_solver_parameters(world: World, name: str, says: str) -> str:
-    """Name the soft form in the sentence of an effect, before the place in brackets at its end:
-    ``..., in MuJoCo's soft form (solreffriction 0.02 1) (at joint elbow)``.
+    """Add the soft form to the description of an effect, before the place in brackets at its end.
+
+    For example ``..., in MuJoCo's soft form (solreffriction 0.02 1) (at joint elbow)``.
+
+    Args:
+        world: Run evaluator with the effect.
+        name: Name of the effect.
+        says: Description of the effect.
     """
     robot: Any = world.kind
     effect = type(world.effects[name])
@@ -72,13 +91,14 @@ def with_solver_parameters(world: World, name: str, says: str) -> str:
 
 
 def is_likelier_soft(models: Models, model: Model, margin: float) -> bool:
-    """Whether a fitted model of a robot in which dry friction acts, as an effect or as a free
-    number, is likelier in MuJoCo's soft form.
+    """Return whether a robot model with dry friction is likelier with MuJoCo's soft form.
+
+    The dry friction may be an effect or a free number.
 
     Args:
-        models: with stiff friction; their noise and frozen parameters hold.
-        model: one of them.
-        margin: by which twice the log likelihood has to be larger.
+        models: Models with stiff friction, with their noise and frozen parameters.
+        model: One of these models, fitted.
+        margin: Minimum gain in twice the log-likelihood.
     """
     if not has_dry_friction(models.world, model.names) or has_soft_form(models.world):
         return False
@@ -90,20 +110,20 @@ def is_likelier_soft(models: Models, model: Model, margin: float) -> bool:
 
 
 def choose_friction_form(models: Models, model: Model, other: World, margin: float) -> Model | None:
-    """Fit a model again with the other form of dry friction, and return it where it is likelier.
+    """Refit a model with the other form of dry friction, and return it if it is likelier.
 
     Effects with a state that contain dry friction, such as hysteresis, do not act through
-    `frictionloss`. The dry friction that they contain takes their place, since the other form may
-    be all that they imitate.
+    `frictionloss`. They are replaced by the dry friction that they contain, because they may only
+    imitate the other form.
 
     Args:
-        models: of the present form; their noise and frozen parameters hold.
-        model: one of them, which `has_dry_friction`.
-        other: a world of the same runs and parameters, with a simulator of the other form.
-        margin: by which twice the log likelihood has to be larger.
+        models: Models of the present form, with their noise and frozen parameters.
+        model: One of these models, for which `has_dry_friction` is true.
+        other: Run evaluator of the same runs and parameters, with a simulator of the other form.
+        margin: Minimum gain in twice the log-likelihood.
 
     Returns:
-        The model in the other form; None where the present form stands.
+        The model in the other form; None if the present form is kept.
     """
     fitted = _refit_in(other, models, model)
     gain = fitted.likelihood.value - model.likelihood.value
@@ -111,14 +131,14 @@ def choose_friction_form(models: Models, model: Model, other: World, margin: flo
 
 
 def _refit_in(world: World, models: Models, model: Model) -> Model:
-    """Fit the effects of a model in a world of the other form."""
+    """Fit the effects of a model with a run evaluator of the other form."""
     names, theta = with_plain_friction(models.world, model.names, model.fit.theta)
-    # The random numbers of these models decide nothing.
+    # The random numbers of these models do not affect the result.
     others = Models(world, models.noise, models.frozen, rng_for("friction form"), models.stated)
     fitted = others.fit_one(Start(names, theta, model.fit.states))
     if models.world.correction is None:
         return fitted
-    # Both forms are compared without the error of the integrator's step.
+    # Both forms are compared without the discretisation error of the integrator.
     from bench.gap.model.tangents import correct
 
     correct(world, models.noise, fitted.fit.theta, fitted.fit.states)
@@ -127,13 +147,18 @@ def _refit_in(world: World, models: Models, model: Model) -> Model:
 
 
 def _is_dry_friction(effect: type[Effect]) -> bool:
-    """Whether an effect, or a member of a family, acts through `frictionloss`."""
+    """Return whether an effect, or a member of a family, acts through `frictionloss`."""
     members = getattr(effect, "members", ())
     return issubclass(effect, Friction) or any(isinstance(one, Friction) for one in members)
 
 
 def plain_friction(world: World, name: str) -> str:
-    """The dry friction that an effect with a state contains; other effects themselves."""
+    """Return the dry friction that an effect with a state contains, or else the effect itself.
+
+    Args:
+        world: Run evaluator with the effect.
+        name: Name of the effect.
+    """
     effect = world.effects[name]
     if effect.hook != "hidden":
         return name
@@ -145,22 +170,22 @@ def plain_friction(world: World, name: str) -> str:
 def with_plain_friction(
     world: World, names: Iterable[str], theta: Array
 ) -> tuple[tuple[str, ...], Array]:
-    """Put dry friction in the place of effects with a state that contain it.
+    """Replace effects with a state by the dry friction that they contain.
 
     Args:
-        world: the runs.
-        names: effects of a model.
-        theta: (P,) its parameters.
+        world: Run evaluator of the runs.
+        names: Names of the effects of a model.
+        theta: (P,) parameters of the model.
 
     Returns:
-        The names and the parameters of the model without these states.
+        Names of the effects and parameters of the model without these states.
     """
     theta, plain = theta.copy(), dict[str, None]()
     for name in names:
         friction = plain_friction(world, name)
         plain[friction] = None
         if friction != name:
-            # The first coefficient of both is the limit of the friction.
+            # The first coefficient of both effects is the limit of the friction force.
             theta[world.places(friction)[0]] += theta[world.places(name)[0]]
             theta[world.places(name)] = 0.0
     return tuple(plain), theta

@@ -1,7 +1,7 @@
-"""Held-out runs: models on runs of which nothing but initial states is fitted.
+"""Held-out runs: predict them with fitted models, and fit only their initial states.
 
-Of n samples, with f initial states that the data fix, the merit of a model with log likelihood L is
-that of G. Schwarz (Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136):
+For n samples with f effective initial states, the penalised log-likelihood of a model with
+log-likelihood L is that of G. Schwarz (Ann. Stat. 6(2), 461, 1978, doi:10.1214/aos/1176344136):
 
     M = 2 log L - f log n                                                                      (1)
 """
@@ -22,32 +22,38 @@ from bench.gap.model.world import World
 from sims.base import Array
 
 STAGES = ((0.2, 6), (0.45, 6), (0.7, 6), (1.0, 10))
-"""Shares of a run over which its initial state is fitted one after another, and steps of each."""
+"""Stages of the fit of initial states: fraction of each run, and maximum number of steps."""
 FOLLOWED = ((1.0, 6),)
-"""The same of a robot whose runs a filter has followed: they begin near their best states."""
+"""Stages of the fit of initial states, as in `STAGES`, for a robot whose runs are filtered. These
+runs begin near their best states.
+"""
 FAR = 1.5
-"""Mean square, in units of the noise, from which the nearest model is fitted in stages too."""
+"""Minimum mean square residual of the nearest model, in noise variances, for which models that
+start from filtered states are also fitted in stages.
+"""
 BENT = 0.3
-"""RMS, in units of the noise, by which a motion may miss what derivatives by its initial states
-make of it, before these are taken anew.
+"""Maximum RMS linearisation error of a motion in units of the noise. Above it, the derivatives by
+the initial states are computed again.
 """
 NEARER = 3.0
-"""Decrease of the sum of squares, in units of the noise, by which fits are led on."""
+"""Minimum decrease of the sum of squares, in noise variances, by fresh derivatives, for which the
+fits are repeated with derivatives that are computed again before each stage.
+"""
 TWICE = 2.0
-"""Models this much farther from held-out runs than the nearest one, as a sum of squares, are fitted
-there once more.
+"""Ratio of a model's sum of squares to that of the nearest model from which it is refitted on the
+held-out runs.
 """
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Runs simulated with parameters that were fitted to other runs.
+    """Prediction of runs with parameters that were fitted to other runs.
 
     Attributes:
-        simulated: (R, T, C); NaN if the simulation failed.
-        merit: (1), minus infinity if the simulation failed.
+        simulated: (R, T, C) prediction; NaN if the simulation failed.
+        merit: Penalised log-likelihood (1); minus infinity if the simulation failed.
         states: (R, s) initial states, fitted to these runs.
-        freedom: effective number of these states, the f of (1).
+        freedom: Effective number of initial states, f in (1).
     """
 
     simulated: Array
@@ -57,14 +63,15 @@ class Measured:
 
 
 class Validation(Protocol):
-    """Predict runs with models that were fitted to other runs: on held-out runs, or by
-    cross-validation (`bench.gap.cross_validation`).
+    """Protocol for the prediction of runs with models that were fitted to other runs.
+
+    The runs are held-out runs, or all runs in turn (`bench.gap.cross_validation`).
 
     Attributes:
-        world: the runs that are predicted.
-        noise: weighs the channels.
-        seen: (R, T, C) samples that exist.
-        is_cross_validation: whether the runs are also those that the reported model is fitted to.
+        world: Run evaluator of the predicted runs.
+        noise: Noise that weights the channels.
+        seen: (R, T, C) mask of the available samples.
+        is_cross_validation: Whether the reported model is fitted to these runs too.
     """
 
     world: World
@@ -82,16 +89,16 @@ class Validation(Protocol):
         ...
 
     def close(self) -> None:
-        """Release what the simulators hold."""
+        """Release the resources of the simulators."""
         ...
 
 
 class HeldOutRuns:
-    """Runs on which nothing is fitted but their initial states.
+    """Validation on held-out runs, of which only the initial states are fitted.
 
     Args:
-        world: the runs, with the effects of the fitted model in the same places.
-        noise: weighs the channels.
+        world: Run evaluator of the runs, with the effects at the same indices as in the fit.
+        noise: Noise that weights the channels.
     """
 
     is_cross_validation = False
@@ -107,44 +114,44 @@ class HeldOutRuns:
         return self.world.simulations
 
     def close(self) -> None:
-        """Release what the simulator holds."""
+        """Release the resources of the simulator."""
         self.world.close()
 
     def validate(self, fits: Sequence[Fit]) -> list[Measured]:
-        """Predict the held-out runs with each model; as `measure`."""
+        """Predict the held-out runs with each model; see `measure`."""
         return self.measure([fit.theta for fit in fits])
 
     def measure(self, thetas: Sequence[Array]) -> list[Measured]:
-        """Simulate with each parameter vector (P,), initial states estimated run by run.
+        """Simulate the runs with each parameter vector (P,) and fit their initial states.
 
-        Least squares may end in another minimum for one model than for its neighbour, and luck
-        would then decide between them: every model is fitted again from the states of the nearest
-        one, and the better fit counts.
+        Least squares may converge to a different minimum for similar models, and chance would then
+        decide between them. Models far from the nearest one are therefore fitted again from its
+        initial states, and the better fit counts.
         """
         guess = self.world.guess
         begun = [Start((), theta, guess) for theta in thetas]
         followed = self.world.followed is not None
         fits = self._fitted(begun, FOLLOWED if followed else STAGES)
         count = max(int(self.seen.sum()), 1)
-        # A run that amplifies where it begins is followed from its beginning on.
+        # Runs that amplify differences of the initial state need a fit in stages.
         if followed and not _nearest(fits).cost < FAR * count:
             fits = _each_nearer(fits, self._fitted(begun, STAGES))
             followed = False
         if not followed and self._bends(_nearest(fits)):
             fits = self._led(begun, fits)
         nearest = _nearest(fits)
-        # Asked this way round, since a fit that failed has a cost that is no number.
+        # The comparison is negated because the cost of a failed fit may be NaN.
         limit = TWICE * nearest.cost
         apart = [i for i, fit in enumerate(fits) if not fit.cost < limit]
         starts = [replace(fits[i].start(), states=nearest.states) for i in apart]
-        # These states are good over the first share of the runs already.
+        # These initial states are good over the first fraction of the runs already.
         again = self._fitted(starts, FOLLOWED if followed else STAGES[1:])
         for i, fit in zip(apart, again, strict=True):
             fits[i] = _nearest([fits[i], fit])
         return [self._measured(fit) for fit in fits]
 
     def _fitted(self, starts: Sequence[Start], stages: Sequence[tuple[float, int]]) -> list[Fit]:
-        """Initial states fitted over longer and longer parts of the runs."""
+        """Fit initial states over increasing parts of the runs."""
         fits: list[Fit] = []
         if not starts:
             return fits
@@ -159,9 +166,10 @@ class HeldOutRuns:
         return fits
 
     def _bends(self, fit: Fit) -> bool:
-        """Whether the motion is no longer what a robot's derivatives by initial states, which are
-        taken once for all models, make of it. One that is chaotic leaves them where its guess is
-        off by no more than the noise.
+        """Return whether the motion has left the range of its linearisation by the initial states.
+
+        For a robot this linearisation is computed once for all models. A chaotic motion leaves its
+        range even if the initial guess is off by no more than the noise.
         """
         world = self.world
         if not world.linear or not np.isfinite(fit.cost):
@@ -170,17 +178,19 @@ class HeldOutRuns:
         lanes = np.tile(fit.theta, (runs, 1))
         begun = world.simulate(lanes, np.arange(runs), world.guess)
         moved = fit.states - world.guess
-        # A guess that explodes is infinite, or NaN.
+        # A diverging simulation from the guess is infinite or NaN.
         with np.errstate(over="ignore", invalid="ignore"):
             missed = fit.simulated - begun - np.einsum("rtcs,rs->rtc", fit.jacobian, moved)
             sizes = (missed / self.noise.sigma)[self.seen]
             rms = float(np.sqrt(np.square(sizes).mean()))
-        # Asked this way round, since NaN compares with nothing.
+        # The comparison is negated because NaN compares as false.
         return not rms < BENT
 
     def _led(self, starts: Sequence[Start], fits: Sequence[Fit]) -> list[Fit]:
-        """The fits with derivatives about the nearest of them; where these lead any nearer, fitted
-        from the starts again with derivatives that are taken anew before each stage.
+        """Continue the fits with derivatives at the nearest of them.
+
+        If that reduces the nearest sum of squares enough, the fits are repeated from the starts
+        with derivatives that are computed again before each stage.
         """
         found = _each_nearer(fits, self._about(fits, STAGES[-1:]))
         if _nearest(fits).cost - _nearest(found).cost < NEARER:
@@ -191,8 +201,8 @@ class HeldOutRuns:
         return _each_nearer(found, led)
 
     def _about(self, fits: Sequence[Fit], stages: Sequence[tuple[float, int]]) -> list[Fit]:
-        """The fits led on, with derivatives about the nearest of them."""
-        # loaded where there is a robot alone
+        """Continue the fits with derivatives at the nearest of them."""
+        # This import is needed for robots only.
         from bench.gap.model.tangents import begun
 
         nearest = _nearest(fits)
@@ -203,14 +213,20 @@ class HeldOutRuns:
         if not np.isfinite(fit.cost):
             nothing = np.full_like(self.world.observed, np.nan)
             return Measured(nothing, -np.inf, fit.states)
-        # Only initial states were fitted here, so they alone count as free.
+        # Only initial states were fitted here, so only they count as free.
         free = freedom(self.world, fit, self.noise)
         merit = merit_of(self.world.observed, fit.simulated, free)
         return Measured(fit.simulated, merit, fit.states, free)
 
 
 def merit_of(observed: Array, simulated: Array, free: float) -> float:
-    """Merit (1) of predictions (R, T, C) with so many free initial states."""
+    """Compute the penalised log-likelihood (1) of predictions.
+
+    Args:
+        observed: (R, T, C) observations; NaN where missing.
+        simulated: (R, T, C) predictions.
+        free: Effective number of free initial states.
+    """
     seen = np.isfinite(observed)
     residual = np.where(seen, observed - simulated, 0.0)
     price = float(np.log(max(int(seen.sum()), 2)))
@@ -218,10 +234,10 @@ def merit_of(observed: Array, simulated: Array, free: float) -> float:
 
 
 def _nearest(fits: Iterable[Fit]) -> Fit:
-    """The fit that leaves the least."""
+    """Return the fit with the smallest cost."""
     return min(fits, key=lambda fit: fit.cost)
 
 
 def _each_nearer(fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
-    """Of each model the nearer of two fits."""
+    """Return the better of two fits of each model."""
     return [_nearest(pair) for pair in zip(fits, others, strict=True)]

@@ -1,20 +1,20 @@
-"""What one recording can say of each number: identifiable, weak or not, and what is mixed up.
+"""Identifiability of each parameter and cause: identifiable, weak or not, and what it confounds.
 
-With D the derivatives of all that is recorded by the numbers in question, in units of the noise and
-without what the initial states of each run absorb, the covariance that a fit would have is the
-inverse of the Fisher information
+D are the derivatives of all recorded samples by the parameters, in units of the noise and projected
+onto the complement of the derivatives by the initial states of each run. The covariance of a fit is
+then the inverse of the Fisher information
 
     F = D'D,    cov = F^-1                                                                     (1)
 
 (E. Walter, L. Pronzato, Identification of Parametric Models from Experimental Data, 1997, chapter
-4; C. Brun, P. Reichert, H. R. Kuensch, Water Resources Research 37(4), 1015, 2001, for what is weak
-and what is collinear). Numbers that are free are looked at together; a cause by itself, beside
-them, since one is asked about at a time. Two causes are mixed up where their derivatives are nearly
-parallel,
+4; C. Brun, P. Reichert, H. R. Kuensch, Water Resources Research 37(4), 1015, 2001, for weak and
+collinear parameters). Free parameters are assessed together. Each cause is assessed alone, in
+addition to the free parameters, because causes are tested one at a time. Two causes are confounded
+if their derivatives are nearly parallel,
 
     corr = |d_i'd_j| / (|d_i| |d_j|)                                                           (2)
 
-Noise is taken for white, and the model for what it is where it fits the recording now.
+White noise is assumed, and the derivatives are those of the model that fits the recording now.
 """
 
 from __future__ import annotations
@@ -37,28 +37,32 @@ from sims.system import FAMILY
 Word = Literal["identifiable", "weak", "not identifiable"]
 
 NARROW, WIDE = 0.1, 1.0
-"""Widths of an interval, shares of a number's range, up to which it is identifiable, and weak."""
+"""Maximum width of a 95 % interval, as a fraction of a parameter's range, for identifiable and for
+weak parameters.
+"""
 FAINT = 5.0
-"""Noises by which a limit changes all samples together that can just be told to be there."""
+"""Minimum norm of the change of all samples by a limit or backlash, in noise standard deviations,
+for it to be detectable.
+"""
 MIXED = 0.95
-"""Correlation from which two numbers are mixed up."""
+"""Minimum correlation of two parameters that are reported as confounded."""
 MOST = 4
-"""Others that are named, at most."""
+"""Maximum number of confounded parameters that are reported for one parameter."""
 
 
 @dataclass(frozen=True)
 class Number:
-    """What a recording can say of one number.
+    """Identifiability of one parameter or coefficient of a cause.
 
     Attributes:
-        name: of a parameter, or of a cause with its coefficient.
-        free: whether it is a parameter that a fit has anyway.
-        unit: of it.
-        half: half the width of its 95 % interval; infinite where the recording does not touch it,
-            NaN of a limit, which shows or does not.
-        low, high: its plausible range.
-        word: identifiable, weak or not identifiable.
-        mixed: others that it is mixed up with, and by what correlation.
+        name: Name of the parameter, or of the cause with its coefficient.
+        free: Whether it is a free parameter of the fit; False for a cause.
+        unit: Unit of the value.
+        half: Half the width of the 95 % interval; infinite if the recording is insensitive to it,
+            NaN for a limit or backlash, which is either detectable or not.
+        low, high: Plausible range.
+        word: Identifiability level.
+        mixed: Names of confounded parameters with their correlation.
     """
 
     name: str
@@ -74,14 +78,16 @@ class Number:
 def identified(
     world: World, noise: Noise, fit: Fit, found: Directions | None = None
 ) -> tuple[Number, ...]:
-    """What the runs can say of every free number, and of every cause: free ones first, then causes,
-    the surest first.
+    """Assess the identifiability of every free parameter and of every cause.
 
     Args:
-        world: the runs.
-        noise: of each channel.
-        fit: about which; with its derivatives.
-        found: what each cause changes there, where that is known already.
+        world: Run evaluator of the runs.
+        noise: Noise of each channel.
+        fit: Fit with its derivatives; the linearisation point.
+        found: Sensitivity directions of the causes at this point, if they are known.
+
+    Returns:
+        Free parameters first, then causes, those with the narrowest intervals first.
     """
     if found is None:
         names = [name for name in world.library if world.effects[name].place != FAMILY]
@@ -98,7 +104,7 @@ class _Identified:
         jacobian /= noise.sigma[:, None]
         runs = len(jacobian)
         flat = jacobian.reshape(runs, -1, jacobian.shape[3])
-        # A known initial state absorbs nothing.
+        # A known initial state is not fitted, so nothing is projected out for it.
         self.states = flat[..., q:] * ~world.known[:, None, :]
         self.parameters = self._without_states(flat[..., :q])
 
@@ -108,7 +114,7 @@ class _Identified:
         return (*free, *causes)
 
     def _without_states(self, columns: Array) -> Array:
-        """(N, k) columns (R, n, k) without what each run's initial state absorbs."""
+        """Project the initial states of each run out of columns (R, n, k); return (N, k)."""
         b = self.states
         precision = np.diag(prior_of(self.world) ** -2.0)
         normal = np.matmul(b.transpose(0, 2, 1), b) + precision
@@ -118,7 +124,7 @@ class _Identified:
         return left.reshape(runs * samples, count)
 
     def _free(self) -> list[Number]:
-        """The parameters, all of them at once, by (1)."""
+        """Assess the free parameters jointly by (1)."""
         own = self.parameters
         scale = np.sqrt(np.einsum("nk,nk->k", own, own))
         touched = scale > 0
@@ -143,7 +149,7 @@ class _Identified:
             numbers.append(
                 _number(parameter.name, True, parameter.unit, Z95 * sd, (low, high), mixed)
             )
-        # What the runs do not touch was frozen by the fit.
+        # The fit has frozen parameters to which the runs are insensitive.
         for place in sorted(set(self.world.base.tolist()) - set(self.fit.free.tolist())):
             parameter = self.world.parameters[place]
             numbers.append(
@@ -152,7 +158,7 @@ class _Identified:
         return numbers
 
     def _causes(self) -> list[Number]:
-        """Every cause by itself, beside the free numbers; families are their members."""
+        """Assess every cause alone next to the free parameters; families by their members."""
         world = self.world
         probes = [p for p in self.found.probes if world.effects[p.effect].place != FAMILY]
         mine = [world.effects[p.effect].place != FAMILY for p in self.found.probes]
@@ -165,7 +171,7 @@ class _Identified:
             basis, _ = np.linalg.qr(self.parameters)
             columns -= basis @ (basis.T @ columns)
         powers = np.sqrt(np.einsum("nk,nk->k", columns, columns))
-        # Of several shapes of a coefficient the one that shows best stands for it.
+        # A coefficient with several shapes is represented by the most sensitive one.
         best: dict[tuple[str, int], int] = {}
         limits = {probe.effect for probe in probes if probe.fixed}
         for k, probe in enumerate(probes):
@@ -190,7 +196,8 @@ class _Identified:
             single = sum(1 for own, _ in best if own == name) == 1
             label = name if single else f"{name} {parameter.name.rpartition('.')[2]}"
             if probe.fixed:
-                # A limit or a gap is no matter of proportion: it shows where it is reached.
+                # The effect of a limit or backlash is not proportional to it; it shows if it is
+                # reached.
                 own = _number(label, False, parameter.unit, 0.0, parameter.bounds, mixed)
                 numbers.append(replace(own, half=np.nan, word=_shown(float(powers[k]))))
                 continue
@@ -199,7 +206,7 @@ class _Identified:
 
 
 def _shown(noises: float) -> Word:
-    """Of a limit that changes this much, in noises."""
+    """Return the level of a limit or backlash that changes the samples by this norm."""
     if noises < FAINT:
         return "not identifiable"
     return "weak" if noises < FAINT / NARROW else "identifiable"
@@ -224,19 +231,18 @@ def _number(
 
 
 def told(numbers: Sequence[Number], most: int = 8) -> list[str]:
-    """Lines for the terminal: the free numbers, the causes that show best, and how many more there
-    are.
+    """Format the free parameters and the best identifiable causes as lines for the terminal.
 
     Args:
-        numbers: of `identified`.
-        most: causes that have a line of their own, and names in a list of others.
+        numbers: Result of `identified`.
+        most: Maximum number of causes with their own line, and of names in a list.
     """
     lines = ["what this recording can determine (95 % intervals, white noise assumed):"]
     lines += [f"  {_line(number)}" for number in numbers if number.free]
     causes = {word: [n for n in numbers if not n.free and n.word == word] for word in _WORDS}
     counts = [f"{len(those)} {word}" for word, those in causes.items()]
     lines.append(f"causes, each by itself, surest first: {', '.join(counts)}")
-    # A limit shows or does not: it has no interval, and comes after those that have one.
+    # A limit has no interval, and follows the causes that have one.
     sure = sorted(causes["identifiable"], key=lambda number: bool(np.isnan(number.half)))
     lines += [f"  {_line(number)}" for number in sure[:most]]
     for word, those in (("identifiable too", sure[most:]), *list(causes.items())[1:]):
@@ -248,7 +254,7 @@ def told(numbers: Sequence[Number], most: int = 8) -> list[str]:
 
 
 def _line(number: Number) -> str:
-    """A number with its word, its interval, its range and what it is mixed up with."""
+    """Format one parameter with its level, interval, range and confounded parameters."""
     half = f"±{number.half:.2g} {number.unit}" if np.isfinite(number.half) else "untouched"
     if np.isnan(number.half):
         half = "a limit within reach"
@@ -259,7 +265,7 @@ def _line(number: Number) -> str:
 
 
 def _effects(numbers: Sequence[Number]) -> list[str]:
-    """Names of causes; those at places once, with the number of their places."""
+    """List the effects of causes once each, with the number of their places."""
     places: dict[str, set[str]] = {}
     for number in numbers:
         effect, _, place = number.name.partition(" ")[0].partition("@")
@@ -269,7 +275,12 @@ def _effects(numbers: Sequence[Number]) -> list[str]:
 
 
 def listed(names: Sequence[str], most: int) -> str:
-    """The first names, and how many more there are."""
+    """Join the first names, and count the remaining ones.
+
+    Args:
+        names: Names.
+        most: Maximum number of names to write.
+    """
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
@@ -278,7 +289,7 @@ _WORDS: tuple[Word, ...] = ("identifiable", "weak", "not identifiable")
 
 
 def _share_of_range(number: Number) -> float:
-    """Half the width of a number's interval, as a share of its plausible range."""
+    """Return half the width of an interval as a fraction of the plausible range."""
     width = number.high - number.low
     with np.errstate(over="ignore"):
         return float(np.nan_to_num(number.half) / width) if width > 0 else 0.0

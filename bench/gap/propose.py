@@ -1,14 +1,14 @@
-"""Proposes the experiment that would tell two explanations apart: where their predictions differ
-most.
+"""Propose a discriminating run: the run in which the predictions of two models differ most.
 
-A T-optimal design over a few changes that an experimenter can make (A. C. Atkinson, V. V. Fedorov,
-Biometrika 62(1), 57, 1975, doi:10.1093/biomet/62.1.57), the rival's parameters held at what these
-data made of them. Of a run x with T samples of C channels the two models differ by
+It is a T-optimal design over a few changes that an experimenter can make (A. C. Atkinson, V. V.
+Fedorov, Biometrika 62(1), 57, 1975, doi:10.1093/biomet/62.1.57), with the competing model's
+parameters fixed at their fit to the present data. On a run x with T samples of C channels the two
+models differ by
 
     apart(x) = sqrt(mean over t, c of ((y_model - y_rival) / sigma_c)^2)                       (1)
 
-Of a robot no run is proposed that exceeds a limit of the model file (`bench.gap.rig`): commands and
-initial states keep to it, and the motion is simulated with both models.
+For a robot no run is proposed that exceeds a limit of the model file (`bench.gap.rig`): commands
+and initial states are limited, and the motion is simulated with both models.
 """
 
 from __future__ import annotations
@@ -25,32 +25,34 @@ from bench.gap.rig.stated_limits import UNLIMITED, Interval, StatedLimits, state
 from sims.base import Array, Scenario
 
 TELLING = 2.0
-"""Two models that differ by less than this many sigmas, RMS, would not be told apart by one more
-run.
+"""Minimum RMS difference of two models, in noise standard deviations, for which one more run would
+distinguish them.
 """
 STARTS = (0.3, 2.0, -1.0)
-"""Shares of an initial state that are tried in its place."""
+"""Factors of an initial state that are tried."""
 AT_REST = 0.05
-"""An initial state below this has no share worth a try; the numbers above are taken as they are."""
+"""Minimum magnitude of an initial state to which the factors of `STARTS` apply. A smaller state is
+replaced by the numbers in `STARTS` themselves.
+"""
 LOWEST = 1.0
-"""Height in metres from which what bounces is let go, at least."""
+"""Minimum initial height in metres of a system that bounces."""
 INPUTS = (0.3, 3.0)
-"""Shares of an input that are tried in its place."""
+"""Factors of an input that are tried."""
 ROBOT_INPUTS = (0.3, 2.0)
-"""Shares of a robot's input likewise: it may be driven twice as hard as so far."""
+"""Factors of a robot's input that are tried: it may be driven at most twice as hard as before."""
 LARGER = 1.1
-"""Share of an input from which it is called larger, and below whose reciprocal smaller."""
+"""Minimum factor by which an input must change, up or down, to be a different run."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What to record next.
+    """Proposed run or measurement.
 
     Attributes:
-        says: a sentence.
-        change: by name, what differs from the first run that was fitted: seconds, an initial state,
-            the share of an input; None where no run is proposed.
-        apart: how far apart the two models then are in units of the noise, RMS; None likewise.
+        says: Proposal as a sentence.
+        change: By name, the differences from the first fitted run: seconds, an initial state, or
+            the factor of an input; None if no run is proposed.
+        apart: RMS difference of the two models in units of the noise; None if no run is proposed.
     """
 
     says: str
@@ -58,14 +60,14 @@ class Experiment:
     apart: float | None = None
 
     def document(self) -> dict[str, Any]:
-        """As in verdict.json."""
+        """Return the proposal as in verdict.json."""
         if self.change is None or self.apart is None:
             return {"says": self.says}
         return {"says": self.says, "change": dict(self.change), "apart": self.apart}
 
 
 class _Run(NamedTuple):
-    """A run that could be recorded."""
+    """Candidate run that could be recorded."""
 
     says: str
     change: dict[str, float]
@@ -74,26 +76,26 @@ class _Run(NamedTuple):
 
 
 def next_experiment(models: Models, model: Model, rival: Model) -> Experiment:
-    """What to record next to tell a model from a rival.
+    """Propose a run or measurement that distinguishes a model from a competing model.
 
     Args:
-        models: among which both are.
-        model: the one that stands.
-        rival: what would explain the same.
+        models: Collection that contains both models.
+        model: Model of the present diagnosis.
+        rival: Competing model that explains the data as well.
     """
     world = models.world
     says = ""
     change: dict[str, float] = {}
     largest = 0.0
     apart = [(_apart(world, run, model, rival, models.noise.sigma), run) for run in _runs(world)]
-    # A run on which one of the simulations fails proposes nothing.
+    # A run that cannot be simulated with both models is not proposed.
     apart = [(size, run) for size, run in apart if np.isfinite(size) and size > 0.0]
     apart.sort(key=lambda entry: -entry[0])
     is_limited = False
     if found := _first_within_limits(world, (model, rival), apart):
         largest, (says, change, _, _) = found
         is_limited = largest < TELLING <= apart[0][0]
-    # Effects that both have are no matter of dispute.
+    # Effects that both models have are not in question.
     names = set(model.names)
     rivals = set(rival.names)
     mine = " and ".join(sorted(names - rivals))
@@ -107,21 +109,22 @@ def next_experiment(models: Models, model: Model, rival: Model) -> Experiment:
 def _first_within_limits(
     world: World, models: Sequence[Model], runs: Sequence[tuple[float, _Run]]
 ) -> tuple[float, _Run] | None:
-    """The first of some runs that stays within the limits of a robot, whichever model is true; the
-    first of all for a system without a model file.
+    """Return the first run that stays within the limits of a robot, whichever model is true.
+
+    For a system without a model file it is the first of all runs.
 
     Args:
-        world: of the runs so far.
-        models: that may be true.
-        runs: each with the difference of the models on it, (1), largest first.
+        world: Run evaluator of the present runs.
+        models: Models that may be true.
+        runs: Candidate runs with the difference of the models (1), largest first.
 
     Returns:
-        A run with its difference, 0 where no run that tells the models apart is within the limits;
-        None without runs.
+        A run with its difference, which is 0 if no discriminating run is within the limits; None
+        without runs.
     """
     if not world.kind.has_model or not runs or runs[0][0] < TELLING:
         return runs[0] if runs else None
-    # Loaded for robots alone.
+    # These imports are needed for robots only.
     from bench.gap.rig.limits import Limits
     from bench.gap.rig.plans import Plan
     from bench.gap.rig.plans import Run as RigRun
@@ -135,11 +138,11 @@ def _first_within_limits(
 
 
 def _no_run(world: World, mine: str, other: str, is_limited: bool) -> str:
-    """What to do where no run of this kind would tell, or none within the limits of a robot."""
+    """Write what to do if no such run would discriminate, or none within the limits of a robot."""
     channels = [channel.name for channel in world.kind.channels]
     unseen = ", ".join(name for name in channels if name not in world.channels)
     instead = "measure one of the causes directly"
-    # What another sensor sees may differ where these agree.
+    # Another sensor may measure a difference where these sensors agree.
     if unseen:
         instead = f"record {unseen} besides"
     if is_limited:
@@ -154,18 +157,20 @@ def _no_run(world: World, mine: str, other: str, is_limited: bool) -> str:
 
 
 def _runs(world: World) -> Iterator[_Run]:
-    """Runs like the first one, with more or less of what an experimenter has in hand."""
+    """Yield runs like the first one with one changed duration, initial state or input."""
     limits = stated_limits(world)
     first = _first(world, limits)
-    # Of runs that tell as much the first one is proposed.
+    # If several runs discriminate equally well, the first one is proposed.
     yield _longer(first)
     yield from _elsewhere(world, first, limits)
     yield from _driven(world, first, limits)
 
 
 def _first(world: World, limits: StatedLimits) -> _Run:
-    """The first run that was fitted; of a robot from rest (nobody can throw it), and with commands
-    and positions within their limits.
+    """Return the first fitted run, as the basis of the proposals.
+
+    A robot starts at rest, because it cannot be started in motion, and with commands and positions
+    within their limits.
     """
     track = world.tracks[0]
     if not world.kind.has_model:
@@ -183,7 +188,7 @@ def _first(world: World, limits: StatedLimits) -> _Run:
 
 
 def _limited(values: Any, limits: Interval | None) -> Any:
-    """A number, or several, within an interval."""
+    """Clip a number or an array to an interval."""
     return values if limits is None else np.clip(values, *limits)
 
 
@@ -193,7 +198,7 @@ def _longer(first: _Run) -> _Run:
     twice = np.concatenate([times, times[-1] + later])
     inputs = {}
     for name, signal in first.scenario.inputs.items():
-        # The inputs are given once more from the beginning.
+        # The inputs are repeated from the beginning.
         inputs[name] = np.concatenate([signal, signal[1:]])
     scenario = replace(first.scenario, times=twice, inputs=inputs)
     seconds = float(twice[-1] - twice[0])
@@ -202,7 +207,7 @@ def _longer(first: _Run) -> _Run:
 
 
 def _elsewhere(world: World, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
-    """Started from elsewhere, one state at a time; a robot at rest."""
+    """Yield runs with one changed initial state; a robot starts at rest."""
     system = world.simulator.system
     height = len(system.coordinates) - 1
     named = zip(world.states, _units(world), strict=True)
@@ -211,7 +216,7 @@ def _elsewhere(world: World, first: _Run, limits: StatedLimits) -> Iterator[_Run
         if world.kind.has_model and name not in system.coordinates:
             continue
         for share in STARTS:
-            # Nothing is let go below the ground.
+            # A body cannot be released below the ground.
             if above_ground and share < 0:
                 continue
             states = first.states.copy()
@@ -227,7 +232,7 @@ def _elsewhere(world: World, first: _Run, limits: StatedLimits) -> Iterator[_Run
 
 
 def _driven(world: World, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
-    """Driven more or less, one input at a time, within the limits of the commands."""
+    """Yield runs with one scaled input, within the limits of the commands."""
     shares = ROBOT_INPUTS if world.kind.has_model else INPUTS
     for name, signal in first.scenario.inputs.items():
         if not signal.any():
@@ -246,31 +251,32 @@ def _driven(world: World, first: _Run, limits: StatedLimits) -> Iterator[_Run]:
 
 
 def _largest_share(signal: Array, limits: Interval) -> float:
-    """The factor up to which a signal stays within its limits, rounded down; infinite where
-    nothing limits it.
+    """Return the largest factor that keeps a signal within its limits, rounded down.
+
+    It is infinite if nothing limits the signal.
     """
     ends = zip((float(signal.min()), float(signal.max())), limits, strict=True)
-    # A limit on the other side of zero is not reached by any factor.
+    # No factor reaches a limit of the opposite sign.
     factors = [limit / end for end, limit in ends if np.isfinite(limit) and end * limit > 0]
     return float(np.floor(1e3 * min(factors)) / 1e3) if factors else np.inf
 
 
 def _units(world: World) -> list[str]:
-    """Units of the states: of coordinates, of their rates, of what else there is."""
+    """List the units of the states: coordinates, their rates, and further states."""
     system = world.simulator.system
     units = {channel.name: channel.unit for channel in world.kind.channels}
     lengths = [units.get(name, "m") for name in system.coordinates]
     rates = [f"{unit}/s" for unit in lengths]
-    # Behind the rates an own system may have more, in any unit.
+    # A user-defined system may have further states after the rates, in any unit.
     further = system.rates[len(lengths) :]
     others = [units.get(name, "SI") for name in further]
     return [*lengths, *rates, *others]
 
 
 def _apart(world: World, run: _Run, model: Model, rival: Model, sigma: Array) -> float:
-    """How far apart two models are on a run, (1)."""
+    """Compute the RMS difference (1) of two models on a run."""
     both = [model.fit.theta, rival.fit.theta]
-    # Freed constants are fitted with the parameters, and reach the simulator as constants.
+    # Freed constants are fitted with the parameters, but passed to the simulator as constants.
     places = world.base[world.own :]
     theta = np.delete(np.stack(both), places, axis=1)
     names = [parameter.name for parameter in world.freed]
@@ -281,7 +287,7 @@ def _apart(world: World, run: _Run, model: Model, rival: Model, sigma: Array) ->
         constants = {**run.scenario.constants, **freed}
         scenarios.append(replace(run.scenario, constants=constants))
 
-    # One lane of a call for each model, both from the same initial states.
+    # Each model is one batch element of the call, both with the same initial states.
     initial = {}
     for name, value in zip(world.states, run.states.tolist(), strict=True):
         initial[name] = np.full(2, value)

@@ -1,6 +1,4 @@
-"""What was found in a robot, back in the robot's own file: extended.xml, and extended.urdf where it
-came from a URDF.
-"""
+"""Extended model files of a robot: extended.xml, and extended.urdf for a robot from a URDF."""
 
 from __future__ import annotations
 
@@ -15,12 +13,12 @@ if TYPE_CHECKING:
 
 
 class RobotFiles(NamedTuple):
-    """What a robot's own files become.
+    """Extended model files of a robot.
 
     Attributes:
-        contents: by name.
-        said: what they cannot hold, and what is to be known of what they hold, one line each.
-        before, after: the text of the user's file, and that of the one in its form.
+        contents: Content by file name.
+        said: Notes on the files and on what they cannot express, one line each.
+        before, after: Text of the user's file, and of the extended file in the same format.
     """
 
     contents: Mapping[str, str]
@@ -30,9 +28,10 @@ class RobotFiles(NamedTuple):
 
 
 def robot_files(extended: Extended) -> RobotFiles:
-    """The files of a robot; none for what is no robot.
+    """Build the extended model files of a robot; none for a system that is not a robot.
 
-    They have been loaded again and compared; what would not be as it was meant is left out.
+    The files are loaded again and compared with the intended model; on a mismatch no file is
+    returned.
     """
     kind: Any = extended.kind
     if kind is None or not kind.has_model:
@@ -41,19 +40,19 @@ def robot_files(extended: Extended) -> RobotFiles:
     from sims.robot.markup import without_heading
     from sims.robot.writing import written
 
-    # Models with all meshes are compiled several times: what the search has left makes room.
+    # Models with all meshes are compiled several times, which needs the memory of the search.
     release_free_memory()
     causes, left_out = written_causes(causes_of(extended))
     done = written(kind.robot, causes, extended.title)
     try:
         check(kind.robot, causes, done)
     except RuntimeError as error:
-        # Minutes of search are not thrown away for a file.
+        # An error here must not discard the result of minutes of search.
         return RobotFiles({}, (f"no model file is written, by a fault of simgap: {error}",))
     try:
         before = kind.robot.path.read_text(encoding="utf-8", errors="replace")
     except OSError:
-        # Gone since it was read: what changes is shown without what was.
+        # The file was deleted after it was read; changes are then shown without the old text.
         before = ""
     after = done.xml if done.urdf is None else done.urdf
     return RobotFiles(_named(done), (*left_out, *done.said), before, without_heading(after or ""))
@@ -62,8 +61,15 @@ def robot_files(extended: Extended) -> RobotFiles:
 def written_causes(
     causes: Mapping[str, Mapping[str, Number]],
 ) -> tuple[dict[str, Mapping[str, Number]], tuple[str, ...]]:
-    """The causes that a model file may state, and a line for each that it may not: numbers at a
-    bound of their range, or without an interval, are not results.
+    """Select the causes that a model file may contain.
+
+    Numbers at a bound of their range, or without an interval, are not results and are left out.
+
+    Args:
+        causes: Coefficients by effect.
+
+    Returns:
+        The selected causes, and a line for each number that is left out.
     """
     kept: dict[str, Mapping[str, Number]] = {}
     left_out = []
@@ -71,13 +77,13 @@ def written_causes(
         if effect.startswith("numerics."):
             kept[effect] = numbers
             continue
-        # Of a family each place stands for itself; coefficients of one place go together.
+        # Each place of a family is handled alone; coefficients of one place belong together.
         bad = {key.partition("@")[2]: n for key, n in numbers.items() if not n.is_result}
         own = {key: n for key, n in numbers.items() if key.partition("@")[2] not in bad}
         if own:
             kept[effect] = own
         for place, one in bad.items():
-            # A number that was never fitted is the file's own.
+            # A number that was never fitted has the value of the model file.
             if one.at_bound is None and not one.value:
                 continue
             end = {"low": "lower", "high": "upper", None: ""}[one.at_bound]
@@ -96,8 +102,10 @@ def _named(done: Written) -> dict[str, str]:
 
 
 def causes_of(extended: Extended) -> dict[str, Mapping[str, Number]]:
-    """What was fitted to a robot, as coefficients by effect and place: freed numbers of its file,
-    effects that were found, and the step and integrator if they are not the file's.
+    """Collect the fitted changes of a robot as coefficients by effect.
+
+    They are freed numbers of its model file, diagnosed effects, and the step and integrator if they
+    differ from those of the file.
     """
     kind: Any = extended.kind
     causes: dict[str, Mapping[str, Number]] = {}

@@ -1,5 +1,6 @@
-"""The error of an extended simulator, or of a robot's model file, on another recording: initial
-states are estimated there, nothing else.
+"""Score an extended simulator, or a robot's model file, on another recording.
+
+Only the initial states are estimated on that recording.
 """
 
 from __future__ import annotations
@@ -27,40 +28,43 @@ from sims.recording.recording import Recording, read_recording, system_of
 from sims.simulated import Simulated
 
 MODEL_FILES = (".xml", ".mjcf", ".urdf")
-"""Endings of a robot's files."""
+"""File name extensions of robot model files."""
 
 
 def scored(
     model: Path, recording: str | Path | Recording, held_out: bool = False, force: bool = False
 ) -> dict[str, Any]:
-    """RMSE by channel in its unit, in units of the noise over all channels, runs and samples
-    counted.
+    """Compute the RMS error of a model on a recording, by channel and over all channels.
 
     Args:
-        model: extended.toml, or a robot's model file, as extended.xml.
-        recording: the table, or a recording that is in memory.
-        held_out: count only runs that are marked so.
-        force: whether the user insists on a recording that is refused otherwise.
+        model: An extended.toml, or a robot's model file, such as extended.xml.
+        recording: Recording, or the path of its table.
+        held_out: Count only runs that are marked as held out.
+        force: Use recordings that are otherwise refused.
+
+    Returns:
+        RMSE by channel in its unit, normalised RMSE over all channels in units of the noise, number
+        of runs and samples, and units.
 
     Raises:
-        InputError: a file cannot be read, or the recording is of another system.
+        InputError: A file cannot be read, or the recording is of another system.
     """
     memory = recording if isinstance(recording, Recording) else None
     path = recording.path if isinstance(recording, Recording) else Path(recording)
     if model.suffix not in MODEL_FILES:
         _check_plugin(model)
-    # The description of a file says what it is a recording of, before the table is read.
+    # The description names the system of the recording before the table is read.
     of_robot = memory.model if memory is not None else model_of(path)
     if model.suffix in MODEL_FILES:
         extended, kind = _robot(model, of_robot)
     else:
         extended, kind, _ = opened(model, simulators.get)
-        # Another robot's recording shows by its channels.
+        # A recording of another robot is recognised by its channels.
         if of_robot is None or extended.robot is None:
             _check_system(path, _system(memory or path, of_robot), extended, model)
-    # Every run counts, unless asked otherwise: nothing is fitted here but initial states.
+    # All runs count by default, because only initial states are fitted here.
     data = memory or read_recording(path, kind, whole=True)
-    # What the recording states of itself stands above what the model was fitted with.
+    # Constants of the recording take precedence over those that the model was fitted with.
     data = replace(data, constants={**extended.constants, **data.constants})
     data, _ = leave_out_settling(data, kind)
     runs = data.held_out() if held_out else data.runs
@@ -71,7 +75,7 @@ def scored(
     refuse_huge(data)
     refuse_odd(data, kind, force)
     check_recording(data, kind(engine=engine), force)
-    # Effects that the file does not name are not in the model, so they need not be at hand.
+    # Only the effects in the file are needed; the others are not part of the model.
     world = World(
         kind,
         data,
@@ -88,16 +92,16 @@ def scored(
 
 
 def _check_plugin(model: Path) -> None:
-    """Refuse a file that extends a simulator of the user's own, where its plugin is not given.
+    """Refuse the model of a user-defined simulator whose plugin is not loaded.
 
     Raises:
-        InputError: it does; the message names the option, with the plugin that explain was given
-            where the folder still says so.
+        InputError: The plugin is missing; the message names the option, with the plugin given to
+            explain if it is stored in the folder.
     """
     extended = read(model)
     if extended.robot is not None or extended.system in simulators.names():
         return
-    # It is named and not loaded: a file of numbers must not decide which code is run.
+    # The plugin is only named, not loaded: a data file must not decide which code is run.
     settings = environment(model.parent).get("settings")
     plugins = settings.get("plugin") if isinstance(settings, dict) else None
     files = [str(plugin) for plugin in plugins] if isinstance(plugins, list) else ["FILE.py"]
@@ -109,21 +113,21 @@ def _check_plugin(model: Path) -> None:
 
 
 def _robot(model: Path, stated: ModelFile | None) -> tuple[Extended, type[Simulated]]:
-    """A robot as its file states it: no number of it is fitted, no effect is added."""
+    """Load a robot from its model file, without fitted numbers and without added effects."""
     from sims.robot.reading import read as read_robot
 
     tables = stated.actuators if stated else {}
-    # A file that explain has written has the recording's actuators already.
+    # A file written by explain contains the actuators of the recording already.
     there = {actuator.name for actuator in read_robot(model).actuators}
     lacking = {name: table for name, table in tables.items() if name not in there}
-    # An MJCF states how it is stepped; it may be what was found.
+    # An MJCF contains its own step and integrator, which may be a result of the diagnosis.
     engine = stated.engine if stated and model.suffix == ".urdf" else {}
     kind = cast(type[Simulated], robot(model, lacking, engine))
     return Extended(kind.name, kind.name, None, "", {}, {}, {}, (), kind), kind
 
 
 def _system(recording: Path | Recording, of_robot: ModelFile | None) -> str:
-    """What a recording says that it is of: the name of a robot's model file, or of a system."""
+    """Return the system of a recording: the name of a robot's model file, or of a system."""
     if of_robot is not None:
         return of_robot.path.name
     return recording.system if isinstance(recording, Recording) else system_of(recording)
@@ -141,14 +145,19 @@ def _check_system(recording: Path, system: str, extended: Extended, model: Path)
 def _check_channels(recording: Path, extended: Extended, recorded: list[str]) -> None:
     """Refuse a recording that lacks a channel of the model."""
     for channel in extended.observe:
-        # Without it the error would be one over fewer channels than the model was fitted to.
+        # Otherwise the error would cover fewer channels than the model was fitted to.
         if channel not in recorded:
             raise unknown(f"channel of {recording}", channel, recorded)
 
 
 def theta_of(world: World, extended: Extended) -> Array:
-    """(P,) the numbers of an extended simulator, nominal where it has none."""
-    # Parameters that the file does not state are nominal, coefficients that it does not are off.
+    """Build the parameter vector (P,) of an extended simulator; missing numbers are nominal.
+
+    Args:
+        world: Run evaluator with the effects of the extended simulator.
+        extended: Extended simulator.
+    """
+    # Missing parameters are nominal, and missing coefficients are off.
     theta = world.nominal()
     own = world.parameters[: world.own]
     for place, parameter in enumerate(own):
@@ -165,7 +174,7 @@ def theta_of(world: World, extended: Extended) -> Array:
 
 
 def _simulated(world: World, extended: Extended, sigma: Array) -> Array:
-    """(R, T, C) the runs with the model's numbers, from initial states that are fitted to them."""
+    """Simulate the runs (R, T, C) with the model's numbers, from fitted initial states."""
     white = np.zeros(len(sigma))
     runs = HeldOutRuns(world, Noise(sigma, white))
     (measured,) = runs.measure([theta_of(world, extended)])
@@ -173,7 +182,7 @@ def _simulated(world: World, extended: Extended, sigma: Array) -> Array:
 
 
 def _squares(world: World, simulated: Array) -> Array:
-    """(R, T, C) squared errors; zero where nothing was seen."""
+    """Compute the squared errors (R, T, C); zero where no sample was observed."""
     seen = np.isfinite(world.observed)
     errors = world.observed - simulated
     squares: Array = np.where(seen, np.square(errors), 0.0)
@@ -181,16 +190,16 @@ def _squares(world: World, simulated: Array) -> Array:
 
 
 def _errors(world: World, squares: Array, sigma: Array) -> dict[str, Any]:
-    """RMSE by channel, and over all of them in units of the noise."""
+    """Summarise the RMSE by channel, and over all channels in units of the noise."""
     seen = np.isfinite(world.observed)
     counts = seen.sum(axis=(0, 1))
     rmse = {}
     for c, name in enumerate(world.channels):
-        # A channel without samples here has no error.
+        # A channel without samples has no error.
         if counts[c]:
             total = squares[:, :, c].sum()
             rmse[name] = float(np.sqrt(total / counts[c]))
-    # Each channel in units of its noise, so that all of them may be added.
+    # Errors of different channels can be added in units of their noise.
     in_noise = squares / np.square(sigma)
     normalised = np.sqrt(in_noise.sum() / counts.sum())
     channels = world.simulator.channels

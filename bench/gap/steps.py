@@ -1,4 +1,4 @@
-"""A time step or an integrator as a cause: what the verdict says of it."""
+"""Report a too coarse time step or integrator as the first cause of a verdict."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 
 SURE = 20.0
-"""Twice the log likelihood by which a finer step must explain the data better than the file's own:
-odds of 22,000 to 1.
+"""Minimum gain in twice the log-likelihood of a finer step over the file's own step; it means odds
+of 22,000 to 1.
 """
 PART = 0.5
-"""Share of the base model's gap that a finer step must close alone to be used in the search. With a
-smaller share another missing effect decides which step looks better.
+"""Minimum share of the base model's gap that a finer step must close alone to be used in the
+search. With a smaller share, another missing effect decides which step looks better.
 """
 STEP, INTEGRATOR = "numerics.step", "numerics.integrator"
 _WITH: dict[VerdictName, VerdictName] = {"adequate": "named", "unknown": "partial"}
-"""Verdicts on what is left, and on the whole when the step has been found at fault besides."""
+"""Verdict on the whole if the step was too coarse, by the verdict on the remaining causes."""
 
 
 class Reusable(Generic[Item]):
-    """An iterable that computes each item once, when it is first needed."""
+    """Iterable that computes each item once, when it is first needed."""
 
     def __init__(self, items: Iterator[Item]) -> None:
         self._rest, self._known = items, list[Item]()
 
     def __iter__(self) -> Iterator[Item]:
-        """All items from the first."""
+        """Yield all items from the first."""
         number = 0
         while True:
             if number == len(self._known):
@@ -50,36 +50,36 @@ class Reusable(Generic[Item]):
 
 
 def is_finer_step_better(gain: float, gap: float, left: float) -> bool:
-    """Whether a finer step explains the data better beyond doubt, and closes a large part of the
-    gap without any other change.
+    """Return whether a finer step is significantly better and alone closes a large part of the gap.
 
     Args:
-        gain: twice the log likelihood that it gains for the base model.
-        gap: RMS that the base model leaves with the file's own step over the noise, in its units.
-        left: the same with the finer step.
+        gain: Gain in twice the log-likelihood of the base model.
+        gap: Excess RMS residual of the base model with the file's own step, in units of the noise.
+        left: Excess RMS residual of the base model with the finer step, in units of the noise.
     """
     return gain >= SURE and gap - max(left, 0.0) >= PART * gap
 
 
 def is_finer_model_better(file: tuple[float, float], finer: tuple[float, float]) -> bool:
-    """Whether a model with a finer step is better beyond doubt than one with the file's own.
+    """Return whether a model with a finer step is significantly better than one with the file's.
 
     Args:
-        file: merit (Schwarz's criterion, twice the log likelihood less log n for each number) of
-            the model with the file's step, and what it leaves over the noise, RMS in its units.
-        finer: the same with the finer step. Far from the noise the likelihood is misled by
-            autocorrelated residuals, so the residual must be smaller, too.
+        file: Penalised log-likelihood (twice the log-likelihood less log n for each parameter;
+            Schwarz's criterion) and excess RMS residual in units of the noise, with the file's
+            step.
+        finer: The two values with the finer step. Far from the noise floor, autocorrelated
+            residuals bias the likelihood, so the residual must be smaller too.
     """
     merits, excesses = zip(file, finer, strict=True)
     return not is_alike(merits[1] - merits[0]) and helps(merits, excesses)
 
 
 class Coarse(NamedTuple):
-    """The file's own step was at fault.
+    """Finding that the model file's own step is too coarse.
 
     Attributes:
-        fine: what mends it.
-        gain: twice the log likelihood that it gains.
+        fine: Finer step that corrects the error.
+        gain: Gain in twice the log-likelihood.
     """
 
     fine: Finer
@@ -87,7 +87,12 @@ class Coarse(NamedTuple):
 
 
 def with_numerics(verdict: Verdict, coarse: Coarse) -> Verdict:
-    """The verdict with the step or integrator as its first cause."""
+    """Add the step or integrator to a verdict as its first cause.
+
+    Args:
+        verdict: Verdict on the remaining causes.
+        coarse: Finding that the file's step is too coarse.
+    """
     causes = (*_causes(coarse), *verdict.causes)
     return replace(verdict, verdict=_WITH.get(verdict.verdict, verdict.verdict), causes=causes)
 
@@ -96,7 +101,7 @@ def _causes(coarse: Coarse) -> list[Cause]:
     from sims.robot.numerics import INTEGRATORS
 
     own, numerics = coarse.fine.own, coarse.fine.numerics
-    # Two numbers are fitted at most, so the gain is one of chance with this probability (Wilks).
+    # At most two numbers are chosen, so Wilks' theorem gives this p-value of the gain.
     chance = float(np.exp(-0.5 * min(coarse.gain, 1400.0)))
     error = f"the file's own misses its fine motion by {coarse.fine.error:.2g} times the noise"
     causes = []

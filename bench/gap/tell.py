@@ -1,4 +1,4 @@
-"""Tells a finding: gathers what account, figures and page say of it."""
+"""Collect the data that text, figures and page of a report need."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from sims.base import Array
 from sims.extended import Number as Estimate
 
 TRACKED = {"u", "v", "radius_px"}
-"""Columns that tell the recording of a tracked film."""
+"""Columns by which the recording of a tracked film is recognised."""
 PNG = b"\x89PNG\r\n\x1a\n"
-"""How a file of that kind begins."""
+"""First bytes of every PNG file."""
 MOST_PICTURE = 1_000_000
-"""Bytes of the picture of a track that a page takes in."""
+"""Maximum size in bytes of the track figure that a page includes."""
 
 
 @dataclass(frozen=True)
 class Teller:
-    """Tells what was found.
+    """Builder of the report data of a finding.
 
     Attributes:
-        assessor: puts it into numbers; it knows the recording, the worlds and the noise.
-        search: that has found it.
-        base: the fit of the base model.
-        finding: what was found.
-        notes: what else is to be borne in mind, a sentence each.
+        assessor: Builder of the verdict, with the recording, the run evaluators and the noise.
+        search: Search that produced the finding.
+        base: Fit of the base model.
+        finding: Outcome of the search.
+        notes: Further notes, one sentence each.
     """
 
     assessor: Assessor
@@ -49,16 +49,16 @@ class Teller:
     notes: tuple[str, ...] = ()
 
     def story(self, verdict: Verdict) -> Story:
-        """The story of a verdict on the finding."""
+        """Build the report data for the verdict on the finding."""
         world = self.assessor.fitting
         recording = self.assessor.recording
         before = self.finding.base.fit.simulated
         after = self.finding.model.fit.simulated
-        # Of the finding, not of the recording: a good model knows the noise better.
+        # The noise is that of the finding, because a good model estimates it better.
         sigma = self.assessor.sigma(self.finding)
         held_out, held_out_places = self._held_out(sigma)
         return Story(
-            # A recording without a description is known by its file.
+            # A recording without a title is identified by its file name.
             recording.title or recording.path.stem,
             recording.path,
             verdict,
@@ -82,7 +82,7 @@ class Teller:
         )
 
     def _track(self) -> bytes:
-        """The picture that tracking a film has put beside its recording; nothing of others."""
+        """Return the figure that film tracking saved next to the recording; empty if none."""
         recording = self.assessor.recording
         path = recording.path.with_suffix(".png")
         if not recording.extra.keys() >= TRACKED:
@@ -95,7 +95,7 @@ class Teller:
         return picture if picture.startswith(PNG) and len(picture) <= MOST_PICTURE else b""
 
     def _apart(self) -> Apart:
-        """What runs, logs and loads say by themselves, of the base model and of what was found."""
+        """Assess the consistency of runs, logs and loads for the base and the extended model."""
         if self.finding.cut is not None or self.finding.vague:
             return Apart()
         before = spreads(self.search, self.finding.base)
@@ -103,7 +103,7 @@ class Teller:
         return Apart(before, after, self._rival())
 
     def _rival(self) -> tuple[Spread, ...]:
-        """Of one cause: what its best rival's coefficients would have to be in each group."""
+        """Return the group estimates of the best other effect, for a diagnosis of one cause."""
         if len(self.finding.causes) != 1:
             return ()
         (cause,) = self.finding.causes
@@ -114,7 +114,7 @@ class Teller:
             for model in singles
             if not alike & set(model.names)
             and np.isfinite(model.merit)
-            # A number that moves is to be seen in effects that are one number.
+            # A trend of a coefficient is only visible in effects with a single coefficient.
             and len(self.search.world.places(model.names[0])) == 1
         ]
         if not others:
@@ -125,7 +125,7 @@ class Teller:
         return tuple(own)
 
     def _fixable(self) -> tuple[Number, ...]:
-        """What the recording can say at all, by what was simulated about the base model anyway."""
+        """Assess identifiability from the directions that the search has simulated."""
         key: frozenset[str] = frozenset()
         scanned = self.search.scanned.get(key) or self.search.former.get(key)
         known = self.search.directions_known()
@@ -145,17 +145,17 @@ class Teller:
         return "left out" if self._is_cross_validated else "held out"
 
     def _held_out(self, sigma: Array) -> tuple[Side | None, list[Place]]:
-        """The held-out runs and where their gap is; None and nothing where none was measured."""
+        """Return the held-out runs and their gap locations; None and empty if not measured."""
         world = self.assessor.measuring
         measured = self.finding.measured
         names = self.finding.model.names
-        # Where the data do not fix the base model, nothing is tried on held-out runs.
+        # If the data do not identify the base model, it is not validated on held-out runs.
         if world is None or measured is None or names not in measured:
             return None, []
         before = measured[()].simulated
         after = measured[names].simulated
         places = show.places(world, before, after, sigma, f" ({self._how_validated})")
-        # Channels and phases are told of the fitted runs alone; of held-out ones, each run.
+        # Channels and phases are reported for the fitted runs only; held-out gaps by run.
         runs = [place for place in places if place.kind == "run"]
         return show.side(world, before, after), runs
 
@@ -171,7 +171,7 @@ class Teller:
         return tuple(Shown(c.name, c.unit, size, stated, step) for c, size, stated, step in rows)
 
     def _parameters(self) -> Iterator[Tuned]:
-        """The base parameters before and after; those that the data do not touch are marked."""
+        """Yield the base parameters before and after; insensitive ones are marked."""
         world = self.assessor.fitting
         before = self.assessor.numbers(self.search, self.finding.base)
         after = self.assessor.numbers(self.search, self.finding.model)
@@ -189,13 +189,13 @@ class Teller:
             )
 
     def _remains(self) -> Iterator[str]:
-        """What the extended model leaves unexplained, and what to bear in mind."""
+        """Yield sentences on what the extended model leaves unexplained, and further notes."""
         world = self.assessor.fitting
         remains = self.finding.remains
         for channel in remains.loud:
             times = remains.excess[world.channels.index(channel)]
             yield f"channel {channel} still misses by {times:.3g} times its noise"
-        # Where the test for a force of any shape does not apply, there is nothing to name.
+        # Without a result of the test for unmodelled forces there is no dependence to report.
         if remains.structure and remains.where:
             yield f"what is left behaves like a force that depends on {remains.where}"
         untouched = [world.parameters[i].name for i in sorted(self.base.untouched)]
@@ -210,7 +210,7 @@ class Teller:
         yield from self.notes
 
     def _bordering(self) -> Iterator[str]:
-        """Parameters that a fit leaves at a bound of their range."""
+        """Yield sentences on parameters that a fit leaves at a bound of their range."""
         for one in self._parameters():
             values = one.before[0], one.after[0]
             for when, value, bound in zip(
@@ -226,7 +226,7 @@ class Teller:
                 break
 
     def _why(self) -> Iterator[str]:
-        """Why the verdict is what it is, the most important first."""
+        """Yield the reasons for the verdict, the most important first."""
         finding = self.finding
         if finding.cut is not None:
             return
@@ -247,7 +247,7 @@ class Teller:
 
     def _structure(self) -> str:
         chance = self.finding.remains.p_value
-        # Both count as structure: a residual with a pattern, and one that is merely too large.
+        # Lack of fit is either a residual with a pattern, or one that is only too large.
         if chance < CHANCE:
             return (
                 f"structure is left over (chance {chance:.2g}) "
@@ -257,12 +257,12 @@ class Teller:
 
 
 def _named(effects: list[str]) -> str:
-    """Registered names in a row."""
+    """Join registered names of effects."""
     return f"{effects[0]} and {', '.join(effects[1:])}"
 
 
 def _triple(number: Estimate) -> tuple[float, float, float]:
-    """Value and interval as figures have them: NaN where the data give no bound."""
+    """Return value and interval as used by figures: NaN where the data give no bound."""
     low = np.nan if number.low is None else number.low
     high = np.nan if number.high is None else number.high
     return number.value, low, high

@@ -1,17 +1,19 @@
 """Recognise a wrong unit or a reversed sign of recorded signals before causes are searched.
 
-A column in another unit than its description states is off by a known factor, which no effect of
-the library should explain. Each hypothesis multiplies one signal, or several that share a mistake,
-by such a factor k, or by -1; the base model is fitted again to the rescaled recording. With e the
-RMS of the residual in units of the noise, less one, the hypothesis holds if
+A column in another unit than its description specifies is wrong by a known factor, which no effect
+of the library should explain. Each hypothesis multiplies one signal, or several with the same
+mistake, by such a factor k, or by -1; the base model is fitted again to the rescaled recording.
+With e the excess RMS residual (the RMS of the residual in units of the noise, minus one), the
+hypothesis holds if
 
     e(k) <= REMAINING e(1),    e(k) < e(k / STEP),    e(k) < e(k STEP)                          (1)
 
-that is, if it removes most of the misfit, and if other factors do not do as well. What it leaves
-may have causes of its own, which move the best factor a little; but if a factor within 4 % of k
-leaves less than a third, it is a gain, of 6.0 say, where turns would be 2 pi. Parameters may absorb
-the scale of an input; there a factor of zero, which switches the input off, must do clearly worse.
-Nothing is tried unless the base model misses some channel by more than `GROSS` of what it moves.
+that is, if it removes most of the misfit, and if other factors do not fit as well. The remaining
+residual may have other causes, which move the best factor a little. But if a factor within 4 % of k
+leaves less than a third of it, the signal has a gain error instead: for example a gain of 6.0,
+close to the 2 pi of turns. Parameters may absorb the scale of an input; then a factor of zero,
+which switches the input off, must fit clearly worse. No hypothesis is tested unless the base model
+misses some channel by more than `GROSS` of its standard deviation.
 """
 
 from __future__ import annotations
@@ -38,48 +40,59 @@ from sims.simulated import Simulated
 from sims.user_toml import toml_key
 
 GROSS = 0.1
-"""Residual of the base model, as a share of the standard deviation of a channel, from which units
-are questioned. A gain error of 5 % stays below it."""
+"""Minimum residual of the base model, as a share of the standard deviation of a channel, for which
+units are checked. A gain error of 5 % stays below it.
+"""
 REMAINING = 0.3
-"""Share of the misfit that a correct unit leaves at most."""
+"""Maximum share of the misfit that remains with a correct unit."""
 STEP = 1.25
-"""Factor by which a hypothesis is changed to see whether another factor fits as well."""
+"""Factor by which a hypothesis is changed to test whether another factor fits as well."""
 NEAR = 1.04
-"""A smaller change, to see whether a factor that is no unit explains the data far better."""
+"""Factor by which a hypothesis is changed a little, to test whether a factor that is not a unit
+explains the data far better.
+"""
 FAR_BETTER = 1.0 / 3.0
-"""Share of the misfit of a hypothesis that such a factor leaves."""
+"""Maximum share of a hypothesis's misfit that remains with a nearby factor that rejects it."""
 FOLLOWED = 0.2
-"""Residual, as a share of what a channel moves, that a hypothesis leaves at most."""
+"""Maximum residual that remains with a hypothesis, as a share of the standard deviation of a
+channel.
+"""
 EXPLAINED = 1.5
-"""RMS in units of the noise from which on a hypothesis leaves nothing to explain."""
+"""Maximum RMS residual, in units of the noise, at which a hypothesis explains the data, so that no
+nearby factor is tested.
+"""
 EQUAL = 1.05
-"""Ratio of two misfits below which they count as equal."""
+"""Maximum ratio of two misfits that count as equal."""
 SHARP = 7.0
-"""Twice the log likelihood by which a factor must fit better than others near it."""
+"""Minimum gain in twice the log-likelihood of a factor over others near it."""
 OFF = 1e-6
 """Factor that switches an input off."""
 WORSE = 3.0
-"""Factor by which the misfit must be larger without an input than with it."""
+"""Minimum ratio of the misfit without an input to the misfit with it."""
 TRIED = 2
-"""Hypotheses that are fitted: the best before a fit by the beginning of the runs, and the best by
-all of them."""
+"""Number of hypotheses that are fitted after each of two screenings: by the beginning of the runs,
+and by the whole runs.
+"""
 SCREENED = 12
-"""Hypotheses that are simulated over all of the runs, of those that fit their beginning best."""
+"""Number of hypotheses that are simulated over whole runs: those that fit the beginning of the runs
+best.
+"""
 WORST = 3
-"""Channels of a robot with the largest misfit whose joints are questioned."""
+"""Number of channels of a robot with the largest misfit whose joints are checked."""
 CLOSE = 0.02
-"""Relative difference of a fitted gain from a conversion of units that is taken for it."""
+"""Maximum relative difference between a fitted gain and a unit conversion that are taken as equal.
+"""
 IGNORED = 0.2
-"""Magnitude of a fitted sensor gain at which the reading hardly depends on the simulation: the
-lower bound of the gain's range.
+"""Maximum magnitude of a fitted sensor gain at which the reading hardly depends on the simulation;
+it is the lower bound of the gain's range.
 """
 
 BEGINNING = HORIZONS[0].share
-"""The first share of each run, by which hypotheses are screened."""
+"""First fraction of each run, by which hypotheses are screened."""
 _NAMED = 4
 """Maximum number of signals that a sentence names."""
 _BEYOND = "parameter {} lies beyond the bounds of its range"
-"""What would explain a recording as well whose base fit ends at a bound."""
+"""Alternative explanation for a recording whose base fit ends at a bound."""
 _DEGREE = math.pi / 180.0
 _GRAVITY = 9.80665
 UNITS: Mapping[str, Mapping[str, float]] = {
@@ -99,14 +112,14 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "V": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
     "A": {"A": 1.0, "mA": 1e-3, "kA": 1e3},
 }
-"""By SI unit, the units that people record in, and their gains."""
+"""Factors to the SI unit, by SI unit and by unit in which signals are often recorded."""
 _TOGETHER = (
     {"rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2"},
     {"rad": "turn", "rad/s": "turn/s"},
     {"m": "mm", "m/s": "mm/s", "m/s^2": "mm/s^2"},
     {"m": "cm", "m/s": "cm/s"},
 )
-"""Units that a whole log is in, by SI unit."""
+"""Sets of units that all signals of a log may share, by SI unit."""
 UNITS_IN_WORDS = {
     "deg": "degrees",
     "deg/s": "degrees per second",
@@ -121,20 +134,20 @@ UNITS_IN_WORDS = {
     "cm": "centimetres",
     "g_0": "multiples of standard gravity",
 }
-"""Units in words."""
+"""Names of units in words."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """A recorded channel or input.
+    """Recorded channel or input.
 
     Attributes:
-        name: of the column.
-        kind: ``channels`` or ``inputs``, its table in the description.
-        si: unit that the simulator has.
-        stated: unit that the description states.
-        gain: by which the numbers of the column become SI.
-        scale: the part of it that the description states as a factor of its own.
+        name: Name of the column.
+        kind: Table of the signal in the description, ``channels`` or ``inputs``.
+        si: SI unit that the simulator uses.
+        stated: Unit that the description specifies.
+        gain: Factor from the values of the column to SI units.
+        scale: Part of `gain` that the description specifies as a separate factor.
     """
 
     name: str
@@ -146,18 +159,18 @@ class Signal:
 
     @property
     def said(self) -> str:
-        """``channel q``."""
+        """Signal in words, such as ``channel q``."""
         return f"{self.kind.removesuffix('s')} {self.name}"
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Signals whose numbers are in other units than stated, or have the other sign.
+    """Hypothesis that the values of signals have another unit or sign than specified.
 
     Attributes:
-        signals: which ones.
-        units: that their numbers are in; the stated one where a factor alone is wrong.
-        scale: factor of all signals, in addition to that of the units.
+        signals: Signals that are concerned.
+        units: Actual units of their values; the specified units if only a factor is wrong.
+        scale: Factor of all signals, in addition to that of the units.
     """
 
     signals: tuple[Signal, ...]
@@ -165,12 +178,18 @@ class Hypothesis:
     scale: float = 1.0
 
     def factors(self) -> dict[str, float]:
-        """By signal, what its SI values have to be multiplied by."""
+        """Return the factors by which the SI values have to be multiplied, by signal."""
         pairs = zip(self.signals, self.units, strict=True)
         return {s.name: self.scale * _gain(s, unit) / s.gain for s, unit in pairs}
 
     def fault(self, file: str, before: float | None, after: float | None) -> RecordingFault:
-        """Describe the hypothesis as a fault of the recording, with the lines to change."""
+        """Describe the hypothesis as a fault of the recording, with the lines to change.
+
+        Args:
+            file: Name of the description file.
+            before: RMS residual of the base model in units of the noise; None if not measured.
+            after: RMS residual with the correction; None if not measured.
+        """
         factors = self.factors()
         lines = []
         for signal, unit in zip(self.signals, self.units, strict=True):
@@ -188,7 +207,7 @@ class Hypothesis:
         )
 
     def _scale(self, signal: Signal) -> float:
-        """The key `scale` of a signal's table, of which one may be stated already."""
+        """Return the key `scale` of a signal's table, including a factor already specified."""
         return self.scale * signal.scale
 
     def _says(self, file: str, factors: Mapping[str, float]) -> str:
@@ -212,13 +231,13 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Subject:
-    """What is checked.
+    """Input of the unit check.
 
     Attributes:
-        kind: the simulator's class.
-        recording: the whole recording, as its description states it.
-        engine: the engine's name.
-        free: constants that are estimated with the parameters.
+        kind: Simulator class.
+        recording: Whole recording, in the units that its description specifies.
+        engine: Name of the engine; None for the simulator's own.
+        free: Constants that are estimated with the parameters.
     """
 
     kind: type[Simulated]
@@ -228,15 +247,15 @@ class Subject:
 
     @property
     def file(self) -> str:
-        """Name of the description."""
+        """Name of the description file."""
         return self.recording.path.with_suffix(".toml").name
 
     def signals(self, channels: Sequence[str]) -> tuple[Signal, ...]:
-        """The recorded signals, as stated."""
+        """Return the recorded signals with the units that the description specifies."""
         try:
             stated = stated_columns(self.recording.path, self.kind)
         except InputError:
-            # made in memory, in SI units
+            # A recording made in memory has no description and is in SI units.
             stated = {}
         inputs = [c for c in self.kind.inputs if c.name in self.recording.runs[0].inputs]
         own = [c for c in self.kind.channels if c.name in channels]
@@ -247,28 +266,30 @@ class Subject:
         return tuple(found)
 
     def rescaled(self, factors: Mapping[str, float]) -> Recording:
-        """The recording with signals multiplied."""
+        """Return the recording with signals multiplied by factors."""
         recording = self.recording
         noise = {n: abs(factors.get(n, 1.0)) * s for n, s in recording.noise.items()}
         runs = tuple(_rescaled(run, factors) for run in recording.runs)
         return replace(recording, noise=noise, runs=runs)
 
     def world(self, recording: Recording) -> World:
-        """Its runs for fitting, without any effect."""
+        """Return a run evaluator of a recording's runs for fitting, without any effects."""
         return World(
             self.kind, recording, recording.training(), self.engine, (), self.free, candidates=()
         )
 
 
 def wrong_units(subject: Subject, world: World, noise: Noise, base: Base) -> RecordingFault | None:
-    """The wrong unit or sign that explains nearly all of the misfit of the base model; None where
-    there is none, or nothing is grossly wrong.
+    """Find the wrong unit or sign that explains nearly all of the misfit of the base model.
 
     Args:
-        subject: what is explained.
-        world: its runs for fitting.
-        noise: of each channel.
-        base: the fitted base model.
+        subject: Recording and simulator to check.
+        world: Run evaluator of the runs for fitting.
+        noise: Noise of each channel.
+        base: Fitted base model.
+
+    Returns:
+        The fault; None if there is none, or no channel has a gross misfit.
     """
     seen = np.isfinite(world.observed)
     residual = np.where(seen, world.observed - base.fit.simulated, 0.0)
@@ -294,12 +315,12 @@ def wrong_units(subject: Subject, world: World, noise: Noise, base: Base) -> Rec
             others += [_BEYOND.format(name) for name in _ends(world, base.fit)]
     if not good:
         return None
-    # The simplest of those that fit equally well.
+    # Among hypotheses that fit equally well, the simplest is preferred.
     least = min(after for _, after in good)
     alike = [pair for pair in good if pair[1] <= EQUAL * least]
     alike.sort(key=lambda pair: (len(pair[0].signals), pair[0].scale != 1.0))
     (best, after), *others_alike = alike
-    # Where the sign of a signal does not matter, nothing is wrong with it.
+    # Hypotheses that differ only in the sign are not alternatives.
     same = best.signals, best.units
     rest = [pair for pair in others_alike if (pair[0].signals, pair[0].units) != same]
     others = [*(one.fault(subject.file, None, None).says for one, _ in rest), *others]
@@ -308,16 +329,18 @@ def wrong_units(subject: Subject, world: World, noise: Noise, base: Base) -> Rec
 
 
 def recognised(subject: Subject, world: World, cause: Cause, base: Fit) -> RecordingFault | None:
-    """The wrong unit or sign that a fitted gain of a sensor or an input stands for; None if it
-    stands for none.
+    """Find the wrong unit or sign that a fitted gain of a sensor or an input imitates.
 
-    A reading that hardly depends on the simulation is not an answer either.
+    A gain that makes a reading nearly independent of the simulation is reported as a fault too.
 
     Args:
-        subject: what is explained.
-        world: its runs for fitting.
-        cause: what was found.
-        base: the base model: a parameter at a bound may be what the gain stands for.
+        subject: Recording and simulator to check.
+        world: Run evaluator of the runs for fitting.
+        cause: Diagnosed cause.
+        base: Fit of the base model; the gain may compensate for a parameter at a bound.
+
+    Returns:
+        The fault; None if the cause is not such a gain.
     """
     effect = cause.effect.partition("@")[0]
     if effect not in ("sensor.gain", "input.gain") or len(cause.coefficients) != 1:
@@ -331,7 +354,7 @@ def recognised(subject: Subject, world: World, cause: Cause, base: Fit) -> Recor
     signal = next((s for s in own if s.name == (named or usual)), own[0] if own else None)
     if signal is None or not gain:
         return None
-    # What is recorded is gain times what there is; what acts is gain times what is commanded.
+    # A sensor gain multiplies the true value, an input gain the commanded value.
     factor = 1.0 / gain if kind == "channels" else gain
     for one in _of_one((signal,)):
         wanted = one.factors()[signal.name]
@@ -366,7 +389,7 @@ def _rescaled(run: Run, factors: Mapping[str, float]) -> Run:
 
 
 def _ends(world: World, fit: Fit) -> list[str]:
-    """Parameters that the base fit leaves at a bound."""
+    """List the parameters that the base fit leaves at a bound."""
     found = []
     for place in fit.free.tolist():
         parameter = world.parameters[place]
@@ -376,14 +399,15 @@ def _ends(world: World, fit: Fit) -> list[str]:
 
 
 def _shares(world: World, residual: Array, noise: Noise) -> Array:
-    """(C,) RMS of the residual beyond the noise, as a share of what each channel moves; 0 of one
-    that does not move beyond its noise.
+    """Compute the RMS residual beyond the noise, as a share of each channel's deviation (C,).
+
+    It is 0 for a channel that does not move beyond its noise.
     """
     shares = []
     for c, sigma in enumerate(noise.sigma.tolist()):
         there = np.isfinite(world.observed[..., c])
         moved = float(np.std(world.observed[..., c][there])) if there.any() else 0.0
-        # A simulation that failed has missed all of it.
+        # A failed simulation counts as an infinite residual.
         left = float(np.mean(np.nan_to_num(residual[..., c][there], nan=np.inf) ** 2))
         beyond = max(left - sigma**2, 0.0) ** 0.5
         shares.append(beyond / moved if moved > 3.0 * sigma else 0.0)
@@ -397,7 +421,7 @@ def _rms(residual: Array, seen: Any, noise: Noise) -> float:
 
 
 def _suspects(world: World, shares: Array) -> frozenset[str] | None:
-    """Joints of a robot whose signals are questioned; None of what is no robot: all of them."""
+    """Return the joints and actuators of a robot to check; None for other systems: check all."""
     if not world.kind.has_model:
         return None
     worst = np.argsort(-shares)[:WORST].tolist()
@@ -408,8 +432,10 @@ def _suspects(world: World, shares: Array) -> frozenset[str] | None:
 
 
 def _hypotheses(signals: Sequence[Signal], suspects: frozenset[str] | None) -> Iterator[Hypothesis]:
-    """Every hypothesis: of single signals, of all with one unit, of logs in one system of units,
-    and of joints whose direction is reversed.
+    """Yield all hypotheses.
+
+    They concern single signals, all signals with one unit, logs in one system of units, and joints
+    whose direction is reversed.
     """
     for signal in signals:
         if suspects is None or signal.name.partition(".")[2] in suspects:
@@ -434,7 +460,7 @@ def _hypotheses(signals: Sequence[Signal], suspects: frozenset[str] | None) -> I
 
 
 def _of_one(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
-    """Hypotheses of signals that share a unit."""
+    """Yield the hypotheses of signals that share a unit."""
     first = signals[0]
     own = (first.stated,) * len(signals)
     yield Hypothesis(signals, own, -1.0)
@@ -446,7 +472,7 @@ def _of_one(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
             yield Hypothesis(signals, (unit,) * len(signals))
             yield Hypothesis(signals, (unit,) * len(signals), -1.0)
             reached.add(gain / stated)
-    # what was converted by a program already
+    # These factors undo a conversion that was made twice.
     for factor in [*(1.0 / gain for gain in units.values()), *([1e3, 1e-3] if not units else [])]:
         if not any(math.isclose(factor, known, rel_tol=CLOSE) for known in reached):
             yield Hypothesis(signals, own, factor)
@@ -454,7 +480,7 @@ def _of_one(signals: tuple[Signal, ...]) -> Iterator[Hypothesis]:
 
 
 def _reversed(signals: Sequence[Signal], suspects: frozenset[str] | None) -> Iterator[Hypothesis]:
-    """Joints that turn the other way: the signs of all their channels."""
+    """Yield hypotheses of joints with reversed direction: all their channels change sign."""
     joints: dict[str, list[Signal]] = {}
     for signal in signals:
         quantity, _, joint = signal.name.partition(".")
@@ -466,8 +492,10 @@ def _reversed(signals: Sequence[Signal], suspects: frozenset[str] | None) -> Ite
 
 
 def _promising(subject: Subject, asked: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Those that fit best from the starts of the base fit: by the beginning of the runs, where
-    wrong parameters matter least, and by all of them.
+    """Select the hypotheses that fit best from the starts of the base fit.
+
+    They are screened by the beginning of the runs, where wrong parameters matter least, and then by
+    the whole runs.
     """
 
     def best(those: Sequence[Hypothesis], share: float) -> list[Hypothesis]:
@@ -490,8 +518,10 @@ def _world(subject: Subject, factors: Mapping[str, float]) -> tuple[World, Noise
 
 
 def _fitted(subject: Subject, factors: Mapping[str, float]) -> tuple[float, float]:
-    """What the base model leaves of the rescaled recording: RMS in units of its noise, and the
-    largest share of what a channel moves.
+    """Fit the base model to the rescaled recording.
+
+    Returns:
+        RMS residual in units of the noise, and the largest share of a channel's deviation.
     """
     world, noise = _world(subject, factors)
     fit = fit_base(world, noise).fit
@@ -504,14 +534,17 @@ def _fitted(subject: Subject, factors: Mapping[str, float]) -> tuple[float, floa
 def _distinction(
     subject: Subject, one: Hypothesis, after: float, samples: int
 ) -> Literal["sharp", "absorbed", "none"]:
-    """Whether no factor near that of a hypothesis fits as well, the second half of (1); whether
-    parameters absorb the scale of an input, whose unit can be told nevertheless; or neither.
+    """Test whether a hypothesis is distinct from nearby factors, the second half of (1).
 
     Args:
-        subject: what is checked.
-        one: the hypothesis.
-        after: what it leaves, RMS in units of the noise.
-        samples: number of samples.
+        subject: Recording and simulator to check.
+        one: Hypothesis to test.
+        after: RMS residual with the hypothesis, in units of the noise.
+        samples: Number of samples.
+
+    Returns:
+        ``sharp`` if no nearby factor fits as well; ``absorbed`` if parameters absorb the scale of
+        an input, but its unit can be recognised; ``none`` otherwise.
     """
 
     def left(step: float) -> float:
@@ -526,7 +559,7 @@ def _distinction(
     near = min(left(1.0 / STEP), left(STEP))
     if 2.0 * samples * math.log(near / after) > SHARP:
         return "sharp"
-    # A factor that is no unit of the column is not told by an input that may have any scale.
+    # A factor that is not a unit cannot be recognised for an input of arbitrary scale.
     is_unit = one.scale == 1.0 and all(signal.kind == "inputs" for signal in one.signals)
     absorbed = is_unit and near * EQUAL > after and left(OFF) > WORSE * after
     return "absorbed" if absorbed else "none"

@@ -1,4 +1,4 @@
-"""The verdict: what explain answers, as an object and as verdict.json."""
+"""Verdict: the result of explain, as an object and as verdict.json."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Document = dict[str, Any]
 
 @dataclass(frozen=True, repr=False)
 class Cause:
-    """One effect that the simulator lacks.
+    """Effect that the simulator lacks.
 
     Attributes:
-        effect: its name.
-        alternatives: effects that would explain the same share as well, the most plausible first.
-        says: the effect in a sentence that a person understands.
-        coefficients: its fitted numbers with their 95 % intervals, by name.
-        p_value: chance of a gain like its own if it were not there.
-        form: ``soft`` where dry friction has the solver parameters of the robot's model file, or
-            MuJoCo's defaults; left out where it is stiff, and of all other causes.
+        effect: Name of the effect.
+        alternatives: Effects that explain the data as well, the most plausible first.
+        says: Description of the effect in one sentence.
+        coefficients: Fitted coefficients with their 95 % intervals, by name.
+        p_value: Probability of such a gain if the effect were absent.
+        form: ``soft`` if dry friction has the solver parameters of the robot's model file, or
+            MuJoCo's defaults; None for stiff friction and for all other causes.
     """
 
     effect: str
@@ -39,15 +39,16 @@ class Cause:
 
     @property
     def open_numbers(self) -> dict[str, Number]:
-        """Its numbers that are not results: at a bound, or without an interval. How a robot is
-        stepped was chosen, and has no interval.
+        """Coefficients that are not results: at a bound, or without an interval.
+
+        Time step and integrator are chosen, so they have no interval and are not included.
         """
         if self.effect.startswith("numerics."):
             return {}
         return {name: n for name, n in self.coefficients.items() if not n.is_result}
 
     def document(self) -> Document:
-        """As in verdict.json."""
+        """Return the cause as in verdict.json."""
         return {
             "effect": self.effect,
             "alternatives": list(self.alternatives),
@@ -59,7 +60,7 @@ class Cause:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Cause:
-        """From verdict.json."""
+        """Build a cause from its entry in verdict.json."""
         return cls(
             document["effect"],
             tuple(document["alternatives"]),
@@ -77,17 +78,19 @@ class Cause:
 
 @dataclass(frozen=True, repr=False)
 class Heldout:
-    """Errors on held-out runs, or on each run left out of the fit in turn where two or three runs
-    are not marked; None where the data give no number.
+    """Errors on held-out runs, or on runs left out in turn (cross-validation).
+
+    Cross-validation is used for recordings of two or three runs without marked ones. A value is
+    None if the data give no number.
 
     Attributes:
-        rmse_base: of the tuned base model, in the unit.
-        rmse_extended: of the extended model.
-        noise_floor: what a perfect model would leave.
+        rmse_base: RMSE of the fitted base model, in `unit`.
+        rmse_extended: RMSE of the extended model.
+        noise_floor: RMSE of a perfect model.
         gap_closed: (base - extended) / (base - floor).
-        low: end of its 95 % interval.
-        high: the other end.
-        unit: of the errors; empty if unknown.
+        low: Lower end of the 95 % interval of `gap_closed`.
+        high: Upper end of the 95 % interval of `gap_closed`.
+        unit: Unit of the errors; empty if unknown.
     """
 
     rmse_base: float | None
@@ -99,7 +102,7 @@ class Heldout:
     unit: str = ""
 
     def document(self) -> Document:
-        """As in verdict.json, where what is no number is null."""
+        """Return the errors as in verdict.json, with null where there is no number."""
         numbers = {
             "rmse_base": self.rmse_base,
             "rmse_extended": self.rmse_extended,
@@ -118,14 +121,14 @@ class Heldout:
 
 @dataclass(frozen=True, repr=False)
 class Candidate:
-    """One effect of the library, and the evidence for it about the base model.
+    """Effect of the library with the evidence for it about the base model.
 
     Attributes:
-        effect: its name.
-        score: twice the gain in log likelihood by it alone, less log n for each of its numbers
-            beyond the first, of n samples.
-        p_value: chance of the best score of a library being as high with nothing missing.
-        heldout_gain: share of the gap on held-out runs that it closes alone; None if not measured.
+        effect: Name of the effect.
+        score: Twice the log-likelihood gain of this effect alone, less log n for each of its
+            coefficients beyond the first, for n samples.
+        p_value: Probability that the best score of the library is as high if nothing is missing.
+        heldout_gain: Share of the gap on held-out runs that it closes alone; None if not measured.
     """
 
     effect: str
@@ -134,7 +137,7 @@ class Candidate:
     heldout_gain: float | None
 
     def document(self) -> Document:
-        """As in verdict.json."""
+        """Return the candidate as in verdict.json."""
         return {
             "effect": self.effect,
             "score": self.score,
@@ -148,18 +151,18 @@ class Candidate:
 
 @dataclass(frozen=True)
 class RecordingFault:
-    """A wrong unit or a reversed sign of recorded signals that explains nearly all of the misfit.
+    """Wrong unit or reversed sign of recorded signals that explains nearly all of the misfit.
 
     Attributes:
-        signals: channels and inputs that are concerned.
-        factor: by which SI values of the first one have to be multiplied.
-        unit: that its numbers are in; None where its sign alone is wrong.
-        says: what is wrong, and the change of the description that corrects it.
-        lines: of each signal, its table in the description and the keys to set.
-        error_before: RMS of the base model's residual on the fitted runs, in units of the noise;
-            None where it was not measured.
-        error_after: the same with the correction; None likewise.
-        alternatives: other corrections that explain the recording as well, a sentence each.
+        signals: Channels and inputs that are concerned.
+        factor: Factor by which the SI values of the first one have to be multiplied.
+        unit: Actual unit of its values; None if only its sign or factor is wrong.
+        says: What is wrong, and the change of the description that corrects it.
+        lines: For each signal, its table in the description and the keys to set.
+        error_before: RMS residual of the base model on the fitted runs, in units of the noise; None
+            if not measured.
+        error_after: RMS residual with the correction, in units of the noise; None if not measured.
+        alternatives: Other corrections that explain the recording as well, one sentence each.
     """
 
     signals: tuple[str, ...]
@@ -172,7 +175,7 @@ class RecordingFault:
     alternatives: tuple[str, ...] = ()
 
     def document(self) -> Document:
-        """As in verdict.json."""
+        """Return the fault as in verdict.json."""
         return {
             "signals": list(self.signals),
             "factor": self.factor,
@@ -186,32 +189,33 @@ class RecordingFault:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> RecordingFault:
-        """From verdict.json."""
+        """Build a fault from its entry in verdict.json."""
         lists = ("signals", "lines", "alternatives")
         return cls(**{**document, **{name: tuple(document[name]) for name in lists}})
 
 
 @dataclass(frozen=True, repr=False)
 class Verdict:
-    """What explain answers.
+    """Verdict of explain.
 
     Attributes:
-        verdict: one of six words.
-        system: of the recording.
-        engine: that stepped the simulator; ``its own`` where it steps itself.
-        causes: what the simulator lacks, strongest first.
-        parameters: the base parameters with their 95 % intervals, by name.
-        heldout: the gain on held-out runs, or on runs left out in turn; None where there are
-            neither, or the simulation failed.
-        candidates: the library, the strongest first; empty where nothing was scored.
-        next_experiment: what to record next; None where nothing is open.
-        simulations: how many were spent.
-        seconds: how long it took.
-        cut: that the search was ended early, and what was not asked; None where it came to its end.
-        recording_faults: wrong units or signs of the recording, for which no cause was searched;
-            left out where there are none.
-        recording_notes: how samples of the recording were taken, such as those in which drives are
-            off; left out where there is nothing to say.
+        verdict: One of six words.
+        system: System of the recording.
+        engine: Engine of the simulator; ``its own`` for a simulator with its own integrator.
+        causes: Effects that the simulator lacks, strongest first.
+        parameters: Base parameters with their 95 % intervals, by name.
+        heldout: Gain on held-out runs, or on runs left out in turn; None if there are neither, or
+            the simulation failed.
+        candidates: Effects of the library, best score first; empty if nothing was scored.
+        next_experiment: Proposed next experiment; None if nothing is open.
+        simulations: Number of simulations made.
+        seconds: Duration of the diagnosis in seconds.
+        cut: Early stop of the search, with the questions it skipped; None if the search was
+            complete.
+        recording_faults: Wrong units or signs of the recording, because of which no cause was
+            searched; not in verdict.json if empty.
+        recording_notes: Notes on samples of the recording, such as those with drives switched off;
+            not in verdict.json if empty.
     """
 
     verdict: VerdictName
@@ -230,7 +234,7 @@ class Verdict:
 
     @property
     def says(self) -> str:
-        """What the word means, in one sentence."""
+        """Meaning of the verdict in one sentence."""
         if self.recording_faults:
             return FAULTY
         if self.cut is None and self.has_open_numbers:
@@ -241,20 +245,20 @@ class Verdict:
 
     @property
     def has_open_numbers(self) -> bool:
-        """Whether the verdict is `partial` and a number of a cause is not a result."""
+        """Return whether the verdict is `partial` and a number of a cause is not a result."""
         return self.verdict == "partial" and any(cause.open_numbers for cause in self.causes)
 
     @property
     def bordering(self) -> dict[str, Number]:
-        """Base parameters at a bound of their range, where that makes the verdict `partial`."""
+        """Base parameters at a bound of their range, if they make the verdict `partial`."""
         if self.verdict != "partial" or not self.causes:
             return {}
         numbers = self.parameters.items()
         return {k: n for k, n in numbers if n.at_bound is not None and not n.is_result}
 
     def document(self) -> Document:
-        """The content of verdict.json."""
-        # The order of the keys is that of the page that explains them, and of older files.
+        """Return the content of verdict.json."""
+        # The keys keep the order of the documentation and of older files.
         proposed = self.next_experiment
         faults = [fault.document() for fault in self.recording_faults]
         return {
@@ -275,10 +279,10 @@ class Verdict:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Verdict:
-        """From the content of a verdict.json that explain has written."""
-        # Null stands for what there was nothing to say of.
+        """Build a verdict from the content of a verdict.json that explain has written."""
+        # Null means that there is no value.
         heldout, proposed = document["heldout"], document["next_experiment"]
-        # Older files do not know of it.
+        # Older files do not have this key.
         cut = document.get("cut")
         return cls(
             document["verdict"],
@@ -303,19 +307,19 @@ class Verdict:
 
 
 def finite(value: float) -> float | None:
-    """A number as JSON has it: None where the data gave none."""
-    # NaN is no JSON: strict readers refuse the whole file for it.
+    """Return a number for JSON; None for NaN and infinite values."""
+    # NaN is not valid JSON: strict readers would refuse the whole file.
     return value if np.isfinite(value) else None
 
 
 def _estimates(numbers: Mapping[str, Number]) -> Document:
-    """Numbers as in verdict.json, by name."""
+    """Return numbers as in verdict.json, by name."""
     return {name: _estimate(number) for name, number in numbers.items()}
 
 
 def _estimate(number: Number) -> Document:
     found: Document = {key: getattr(number, key) for key in ("value", "unit", "low", "high")}
-    # What says nothing of a number is left out.
+    # Empty fields are left out.
     for key in ("at_bound", "stated", "total", "total_unit"):
         if (value := getattr(number, key)) not in (None, ""):
             found[key] = value

@@ -2,16 +2,17 @@
 
 A Kalman filter with the model follows the log under each hypothesis
 (`bench.gap.prediction_error.state_estimation`). Hypotheses are compared by the likelihood of the
-recorded numbers y,
+recorded values y,
 
     log L(y | hypothesis) = log L(transformed y) + Σ_c N_c log |k_c|                             (1)
 
-with k_c the factor of channel c and N_c its number of samples. A convention differs where (1) is
+with k_c the factor of channel c and N_c its number of samples. A convention differs if (1) is
 clearly larger than for the log as it is described, and larger than with the best set of causes that
 prediction-error identification selects (`bench.gap.prediction_error.identification`): friction,
 delays and small offsets are causes, not conventions.
 
-Hypotheses are compared on a short part of some runs; the chosen ones are confirmed on all samples.
+Hypotheses are compared on a short part of some runs; the selected ones are confirmed on all
+samples.
 """
 
 from __future__ import annotations
@@ -51,53 +52,53 @@ from sims.recording.recording import Recording, Run
 from sims.robot.simulator import RobotSimulator
 
 LOG_LIKELIHOOD_MARGIN = 20.0
-"""Log likelihood by which a hypothesis must exceed the log as it is described."""
+"""Minimum gain in log-likelihood of a hypothesis over the log as it is described."""
 CAUSES_MARGIN = 10.0
-"""Log likelihood by which it must exceed the best set of causes."""
+"""Minimum gain in log-likelihood of a hypothesis over the best set of causes."""
 EQUAL_LOG_LIKELIHOOD = 3.0
-"""ConventionDifference of log likelihoods below which two hypotheses explain a log equally well."""
+"""Maximum difference of log-likelihoods of two hypotheses that explain a log equally well."""
 MIN_MISSING_FORCE, LARGE_MISSING_FORCE = 0.1, 0.3
-"""Largest missing force of a joint, as a share of its typical force: below the first no convention
-is questioned, and below the second those of this joint alone.
+"""Limits of the largest missing force of a joint, as a share of its typical force. Below the first
+no convention is tested, and below the second only those of this joint.
 """
 SUSPECT_SHARE = 0.1
-"""Missing force of a joint, as a share of its typical force and of the largest such share, from
-which its conventions are questioned.
+"""Minimum missing force of a joint whose conventions are tested, as a share of its typical force,
+and of the largest such share if that exceeds 1.
 """
 OFF_FACTOR = 1e-6
 """Factor that switches an input off."""
 MAX_REMAINING_FORCE = 0.3
-"""Largest missing force with corrected conventions, as a share of the one before."""
+"""Maximum missing force with corrected conventions, as a share of the one before."""
 MAX_SUSPECT_LIMIT = 0.5
-"""Missing force of a joint, as a share of its typical force, from which its conventions are
-questioned in any case.
+"""Missing force of a joint, as a share of its typical force, above which its conventions are tested
+in any case.
 """
 PART_SAMPLES = 60
 """Number of samples of the part of a run on which hypotheses are compared."""
 PART_RUNS = 3
-"""Number of runs of which parts are used."""
+"""Maximum number of runs of which parts are used."""
 MAX_REFINED = 4
 """Maximum number of hypotheses whose offsets are refined."""
 MAX_DIFFERENCES = 3
-"""Maximum number of conventions that are sought one after another."""
+"""Maximum number of conventions that are searched one after another."""
 MIN_REFINEMENT_GAIN = 0.1
-"""Log likelihood that a step of the refinement must gain."""
+"""Minimum gain in log-likelihood of a step of the refinement."""
 FIRST_OFFSET_STEP = 0.3
-"""First step of the refinement of an offset, rad."""
+"""First step of the refinement of an offset, in rad."""
 OFFSET_ACCURACY = 1e-3
-"""Accuracy of an offset, rad."""
+"""Accuracy of a refined offset, in rad."""
 GAIN_EFFECTS = frozenset({"input.gain", "sensor.gain"})
-"""Effects that contain reversed signs and wrong units, and so do not compete with them."""
+"""Effects that contain reversed signs and wrong units, and therefore do not compete with them."""
 
 
 @dataclass(frozen=True)
 class ConventionDifference:
-    """A convention of the log that differs from that of the model file.
+    """Convention of the log that differs from that of the model file.
 
     Attributes:
-        hypothesis: what differs.
-        gain: log likelihood that it gains on the short parts.
-        alternatives: hypotheses that explain the log equally well.
+        hypothesis: Difference between the conventions.
+        gain: Gain in log-likelihood on the short parts.
+        alternatives: Hypotheses that explain the log equally well.
     """
 
     hypothesis: ConventionHypothesis
@@ -106,7 +107,7 @@ class ConventionDifference:
 
     @property
     def description(self) -> str:
-        """What differs, with what would explain the log equally well."""
+        """Description of the difference and of its alternatives."""
         if not self.alternatives:
             return self.hypothesis.description
         others = listed([one.description for one in self.alternatives], MAX_NAMED)
@@ -114,14 +115,14 @@ class ConventionDifference:
 
 
 class ConventionComparison:
-    """Compare conventions of a robot's log with those of its model file.
+    """Comparison of the conventions of a robot's log with those of its model file.
 
     Args:
-        subject: the recording of a robot.
+        subject: Recording of a robot.
 
     Attributes:
-        subject: as given.
-        evaluations: number of hypotheses that a filter has followed.
+        subject: Recording of a robot.
+        evaluations: Number of hypotheses that were evaluated by a filter.
     """
 
     def __init__(self, subject: Subject) -> None:
@@ -130,7 +131,7 @@ class ConventionComparison:
         self._generator = HypothesisGenerator(subject)
 
     def differences(self) -> list[ConventionDifference]:
-        """Return the conventions that differ, the most certain first; an empty list if none do."""
+        """Return the conventions that differ, in the order of the search; empty if none."""
         described = corrected = self.subject.recording
         differences: list[ConventionDifference] = []
         for _ in range(MAX_DIFFERENCES):
@@ -150,19 +151,20 @@ class ConventionComparison:
         return differences if after > before + LOG_LIKELIHOOD_MARGIN else []
 
     def _removes_missing_force(self, described: Recording, corrected: Recording) -> bool:
-        """Return whether corrections leave little of the largest missing force."""
+        """Return whether the corrections leave only a small part of the largest missing force."""
         before, after = map(self._largest_missing_force, (described, corrected))
         return after <= MAX_REMAINING_FORCE * before
 
     def _largest_missing_force(self, recording: Recording) -> float:
-        """Return the largest missing force of a joint, as a share of its typical force; infinity
-        where the filter diverges.
+        """Return the largest missing force of a joint, as a share of its typical force.
+
+        It is infinite if the filter diverges.
         """
         followed = self._follow(self._parts(recording))
         return float((followed.force / followed.typical).max()) if followed.is_sound else np.inf
 
     def _suspects(self, followed: FollowedRuns) -> list[JointSignals]:
-        """Return the joints at which a large force is missing; all where the filter diverges."""
+        """Return the joints with a large missing force; all joints if the filter diverges."""
         if not followed.is_sound:
             return self._generator.joints
         coordinates = self.subject.kind.system.coordinates
@@ -178,9 +180,9 @@ class ConventionComparison:
     def _best_hypothesis(
         self, recording: Recording, suspects: Sequence[JointSignals]
     ) -> ConventionDifference | None:
-        """Return the hypothesis with the largest likelihood; None where none is clearly ahead."""
+        """Return the hypothesis with the largest likelihood; None if none is clearly better."""
         limit = self._evaluate(ConventionHypothesis(""), recording) + LOG_LIKELIHOOD_MARGIN
-        # Most hypotheses fail on one run already.
+        # Most hypotheses already fail on one run.
         first_limit = self._evaluate(ConventionHypothesis(""), recording, runs=1)
         scored: dict[str, tuple[float, ConventionHypothesis]] = {}
         evaluated: list[object] = []
@@ -192,7 +194,7 @@ class ConventionComparison:
             if not self._evaluate(hypothesis, recording, runs=1) > first_limit:
                 continue
             score = self._evaluate(hypothesis, recording)
-            # Of several offsets of one signal the best one is refined.
+            # For several offsets of one signal, the best one is refined.
             known = scored.get(hypothesis.description, (limit, hypothesis))
             if score > known[0]:
                 scored[hypothesis.description] = score, hypothesis
@@ -214,8 +216,9 @@ class ConventionComparison:
     def _uses_inputs(
         self, score: float, hypothesis: ConventionHypothesis, recording: Recording
     ) -> bool:
-        """Return whether a hypothesis on units of inputs alone is better than no inputs at all: a
-        factor that only switches an input off is not a unit.
+        """Return whether a hypothesis on units of inputs alone is better than no inputs at all.
+
+        A factor that only switches an input off is not a unit.
         """
         inputs = recording.runs[0].inputs
         changes = hypothesis.changes
@@ -229,8 +232,10 @@ class ConventionComparison:
     def _refine(
         self, score: float, hypothesis: ConventionHypothesis, recording: Recording
     ) -> tuple[float, ConventionHypothesis]:
-        """Improve the offset of a hypothesis by a pattern search (R. Hooke, T. A. Jeeves, J. ACM
-        8(2), 212, 1961, doi:10.1145/321062.321069).
+        """Improve the offset of a hypothesis by a pattern search.
+
+        The method is that of R. Hooke, T. A. Jeeves, J. ACM 8(2), 212, 1961,
+        doi:10.1145/321062.321069.
         """
         if not hypothesis.has_free_offset:
             return score, hypothesis
@@ -250,12 +255,12 @@ class ConventionComparison:
     def _evaluate(
         self, hypothesis: ConventionHypothesis, recording: Recording, runs: int = PART_RUNS
     ) -> float:
-        """Return the log likelihood (1) on the short parts of a recording.
+        """Return the log-likelihood (1) on the short parts of a recording.
 
         Args:
-            hypothesis: how its conventions differ.
-            recording: as it is described, or with some conventions corrected.
-            runs: maximum number of runs.
+            hypothesis: Difference between the conventions.
+            recording: Recording as it is described, or with some conventions corrected.
+            runs: Maximum number of runs.
         """
         self.evaluations += 1
         parts = self._parts(hypothesis.applied(recording), runs)
@@ -265,7 +270,7 @@ class ConventionComparison:
     def _follow(
         self, recording: Recording, max_linearisations: int = MAX_LINEARISATIONS
     ) -> FollowedRuns:
-        """Follow the training runs of a recording by a filter with the model file's numbers."""
+        """Filter the training runs of a recording with the model file's numbers."""
         world = self.subject.world(recording)
         followed = FollowedRuns.follow(
             world,
@@ -278,15 +283,15 @@ class ConventionComparison:
         return followed
 
     def _gain_of_causes(self, corrected: Recording) -> float:
-        """Return the penalised log likelihood that the best set of causes gains on short parts.
+        """Return the penalised log-likelihood that the best set of causes gains on short parts.
 
-        Each effect is charged half the logarithm of the number of samples for each coefficient
-        (BIC), and the logarithm of the number of effects. Where much is missing, regression is
-        inaccurate, so filters with the effects in the model decide; where the corrected log is not
-        explained either, the larger of both counts.
+        Each effect has a penalty of half the logarithm of the number of samples for each
+        coefficient (BIC), and of the logarithm of the number of effects. With large missing forces,
+        regression is inaccurate, so the gain is computed by filters with the effects in the model.
+        If the corrected log is not explained either, the larger of both gains is used.
 
         Args:
-            corrected: the recording with its conventions corrected.
+            corrected: Recording with its conventions corrected.
         """
         subject = self.subject
         parts = self._parts(subject.recording)
@@ -320,14 +325,15 @@ class ConventionComparison:
         return max(gain, selected.log_likelihood - followed.log_likelihood - penalty)
 
     def _parts(self, recording: Recording, runs: int = PART_RUNS) -> Recording:
-        """Return the parts of some training runs in which most moves."""
+        """Return the parts of some training runs with the largest movement."""
         pairs = zip(recording.training(), self._slices[:runs], strict=False)
         return replace(recording, runs=tuple(run.part(part) for run, part in pairs))
 
     @cached_property
     def _slices(self) -> list[slice]:
-        """Samples of these parts. Where a joint is not recorded, only the beginning of a run has a
-        known pose.
+        """Samples of the parts of the runs.
+
+        If a joint is not recorded, only the beginning of a run has a known pose.
         """
         runs = self.subject.recording.training()[:PART_RUNS]
         coordinates = self.subject.kind.system.coordinates
@@ -337,7 +343,7 @@ class ConventionComparison:
 
 
 def _log_likelihood(followed: FollowedRuns) -> float:
-    """Return the log likelihood of the innovations; minus infinity where the filter diverges."""
+    """Return the log-likelihood of the innovations; minus infinity if the filter diverges."""
     likelihood = followed.log_likelihood
     return likelihood if np.isfinite(likelihood) and followed.is_sound else -np.inf
 
@@ -358,7 +364,7 @@ def _white_noise(world: World, recording: Recording) -> Noise:
 
 
 def _unfitted(world: World) -> Fit:
-    """Return the model file's numbers as a fit, from which probes of effects begin."""
+    """Return the model file's numbers as a fit, the starting point of candidate directions."""
     empty = np.zeros(0)
     return Fit((), world.nominal(), world.guess, np.zeros(0, np.intp), empty, empty, 0.0)
 
@@ -377,9 +383,10 @@ def _with_best_coefficients(followed: FollowedRuns, groups: Sequence[Group]) -> 
 
 
 def _log_likelihood_of_soft_friction(followed: FollowedRuns) -> float:
-    """Return the largest log likelihood with dry friction in MuJoCo's soft form at the joint where
-    most force is missing, which a regression does not contain; minus infinity without such an
-    effect.
+    """Return the largest log-likelihood with dry friction in MuJoCo's soft form.
+
+    The friction acts at the joint with the largest missing force, and is not part of the
+    regression. The result is minus infinity without such an effect.
     """
     world = followed.world
     thetas = [theta for _, theta in soft_friction_models(followed, world.nominal())]

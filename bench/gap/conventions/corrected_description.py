@@ -1,4 +1,4 @@
-"""The description of a recording with conventions corrected: the keys to change, and a file."""
+"""Description of a recording with corrected conventions: the keys to change, and a file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sims.recording.write import publish
 from sims.user_toml import toml_key, toml_text
 
 KINDS = ("channels", "inputs")
-"""Tables of the description that state signals."""
+"""Tables of the description that contain signals."""
 SHOWN = ("column", "unit", "scale", "offset", "unwrap")
 """Keys of a signal that a correction changes, in the order in which they are shown."""
 
@@ -28,9 +28,9 @@ def corrected(
     """Return the content of a description with conventions corrected one after another.
 
     Args:
-        meta: the content of the description.
-        declared: the robot's simulator, which has the units of its signals.
-        differences: what differs.
+        meta: Content of the description.
+        declared: Simulator of the robot, with the units of its signals.
+        differences: Differences to correct, in this order.
     """
     result = copy.deepcopy(dict(meta))
     units = {
@@ -55,7 +55,7 @@ def corrected(
 
 
 def _moved(table: Mapping[str, Any], name: str, change: SignalChange) -> dict[str, Any]:
-    """Return the table of a signal whose numbers are in the column of another signal."""
+    """Return the table of a signal whose values are in the column of another signal."""
     own = dict(table)
     if change.source != name:
         own.setdefault("column", change.source)
@@ -69,8 +69,8 @@ def _changed(
 ) -> dict[str, Any]:
     """Return the table of a signal with another unit, scale or offset.
 
-    With g the gain of the stated unit, recorded numbers r are g (k r + b) in SI; the change makes
-    c (g (k r + b)) + d of it, with d in SI units.
+    With the gain g of the specified unit, recorded values r are g (k r + b) in SI units. The change
+    converts them to c (g (k r + b)) + d, with d in SI units.
     """
     gain = scale(table["unit"], si).gain
     factor, offset = change.scale, change.offset
@@ -94,7 +94,13 @@ def _rounded(value: float) -> float:
 def lines_of(
     meta: Mapping[str, Any], declared: Declared, differences: Sequence[ConventionDifference]
 ) -> Iterator[str]:
-    """Yield the tables of the signals that a correction changes, each in one line."""
+    """Yield the tables of the signals that a correction changes, one line each.
+
+    Args:
+        meta: Content of the description.
+        declared: Simulator of the robot, with the units of its signals.
+        differences: Differences to correct.
+    """
     after, before = corrected(meta, declared, differences), corrected(meta, declared, ())
     for kind in KINDS:
         names = [
@@ -119,20 +125,22 @@ def _shown(value: Any) -> str:
 def write_corrected(
     recording: Path, declared: Declared, differences: Sequence[ConventionDifference], path: Path
 ) -> list[Path]:
-    """Write the corrected description, and beside it the table under the same name where the
-    description has none of its own.
+    """Write the corrected description to a new file.
+
+    If the recording has a table with the name of its description, a copy of it is written next to
+    the new description, with the new name.
 
     Args:
-        recording: the recording's table or description.
-        declared: the robot's simulator.
-        differences: what differs.
+        recording: Table or description of the recording.
+        declared: Simulator of the robot.
+        differences: Differences to correct.
         path: ``NAME.toml``, a new file.
 
     Returns:
         The files that were written.
 
     Raises:
-        InputError: a file exists already, or the path does not end in ``.toml``.
+        InputError: A file exists already, or the path does not end in ``.toml``.
     """
     import tomli_w
 

@@ -1,8 +1,7 @@
 """Hypotheses on how the conventions of a robot's log differ from those of its model file.
 
-Each hypothesis transforms the recorded signals into those that the model means: by a sign, another
-zero, another unit, the place of another joint, whole turns that were left out, or commands that
-were stamped late.
+Each hypothesis transforms the recorded signals to the conventions of the model. It changes a sign,
+a zero position, a unit or the order of joints, restores whole turns, or shifts commands in time.
 """
 
 from __future__ import annotations
@@ -24,19 +23,19 @@ from sims.recording.recording import Recording, Run
 from sims.recording.turns import unwrapped
 
 ANGLES = np.array([-120.0, -70.0, -35.0, -15.0, 15.0, 35.0, 70.0, 120.0, 180.0]) * math.pi / 180.0
-"""Offsets of a zero position that are tried, rad; the best one is refined."""
+"""Offsets of a zero position that are tried, in rad; the best one is refined."""
 MIN_OFFSET = 0.1
-"""Smallest offset of a zero position that counts as a convention, rad. Smaller offsets are errors
+"""Minimum offset of a zero position that counts as a convention, in rad. Smaller offsets are errors
 of calibration and assembly, which are causes.
 """
 LATE_SAMPLES = (1, 2, 3, 4, 5, 6, 8)
-"""Numbers of samples by which commands may be stamped late."""
+"""Delays of command time stamps that are tried, in samples."""
 TICKS_PER_TURN = (4096.0, 4095.0, 8192.0, 16384.0, 65536.0, 1024.0, 1023.0)
-"""Usual resolutions of encoders."""
+"""Common encoder resolutions, in ticks per turn."""
 NORMALISED_RANGE = 100.0
 """Upper end of positions that are normalised to the range of a joint."""
 WRAP_JUMP = 1.5 * math.pi
-"""Difference of successive positions that shows a wrapped position, rad."""
+"""Minimum difference of successive positions that indicates a wrapped position, in rad."""
 MAX_NAMED = 4
 """Maximum number of signals that a sentence names."""
 QUANTITIES = ("q", "qd", "tau")
@@ -45,14 +44,14 @@ QUANTITIES = ("q", "qd", "tau")
 
 @dataclass(frozen=True)
 class SignalChange:
-    """A signal of the model as a function of a recorded signal, in SI units.
+    """Signal of the model as a function of a recorded signal, in SI units.
 
     Attributes:
-        source: name of the recorded signal.
-        scale: factor.
-        offset: added after the factor.
-        unwrap: whether whole turns are restored first.
-        command: name of the command that tells which turn a position is in; empty without one.
+        source: Name of the recorded signal.
+        scale: Factor.
+        offset: Offset that is added after the factor.
+        unwrap: Whether whole turns are restored first.
+        command: Name of the command that determines the turn of a position; empty without one.
     """
 
     source: str
@@ -62,10 +61,10 @@ class SignalChange:
     command: str = ""
 
     def applied(self, signals: Mapping[str, Array]) -> Array:
-        """Return the signal (T,) that the model means.
+        """Return the signal (T,) in the convention of the model.
 
         Args:
-            signals: recorded signals by name, each (T,).
+            signals: Recorded signals by name, each (T,).
         """
         values = signals[self.source]
         if self.unwrap:
@@ -75,14 +74,14 @@ class SignalChange:
 
 @dataclass(frozen=True)
 class ConventionHypothesis:
-    """A convention that may differ.
+    """Convention that may differ.
 
     Attributes:
-        description: a sentence without its end.
-        changes: the signals that differ, by the name that the model has for them.
-        unit: unit of the recorded numbers, where it differs from the stated one alone.
-        has_free_offset: whether the offsets of all changes are one unknown angle.
-        late: time by which commands are stamped late, s.
+        description: Sentence without its final period.
+        changes: Signals that differ, by their name in the model.
+        unit: Unit of the recorded values, if only the specified unit is wrong.
+        has_free_offset: Whether the offsets of all changes are one unknown angle.
+        late: Delay of the command time stamps, in s.
     """
 
     description: str
@@ -97,7 +96,7 @@ class ConventionHypothesis:
         return len(self.changes) + (self.late != 0.0)
 
     def applied(self, recording: Recording) -> Recording:
-        """Return the recording with the signals that the model means."""
+        """Return the recording with its signals in the conventions of the model."""
         noise = dict(recording.noise)
         for name, change in self.changes.items():
             if change.source in recording.noise:
@@ -128,7 +127,7 @@ class ConventionHypothesis:
         )
 
     def shifted(self, step: float) -> ConventionHypothesis:
-        """Return the hypothesis with its offsets changed by a step, rad."""
+        """Return the hypothesis with a step in rad added to its offsets."""
         changes = {
             name: replace(change, offset=change.offset + step)
             for name, change in self.changes.items()
@@ -138,15 +137,15 @@ class ConventionHypothesis:
 
 @dataclass(frozen=True)
 class JointSignals:
-    """A joint and its recorded signals.
+    """Joint and its recorded signals.
 
     Attributes:
-        name: of the joint.
-        channels: names of recorded channels by quantity: ``q``, ``qd``, ``tau``.
-        inputs: names of the inputs of its actuators.
-        servo_inputs: names of the inputs of its position servos.
-        range: limits of its position, rad or m; None where the model states none.
-        is_hinge: whether it turns.
+        name: Name of the joint.
+        channels: Names of recorded channels by quantity: ``q``, ``qd``, ``tau``.
+        inputs: Names of the inputs of its actuators.
+        servo_inputs: Names of the inputs of its position servos.
+        range: Limits of its position, in rad or m; None if the model specifies none.
+        is_hinge: Whether it is a hinge joint.
     """
 
     name: str
@@ -181,10 +180,10 @@ def recorded_joints(subject: Subject) -> list[JointSignals]:
 
 
 class HypothesisGenerator:
-    """Generate hypotheses on the conventions of a recording.
+    """Generator of hypotheses on the conventions of a recording.
 
     Args:
-        subject: the recording of a robot.
+        subject: Recording of a robot.
     """
 
     def __init__(self, subject: Subject) -> None:
@@ -198,9 +197,9 @@ class HypothesisGenerator:
         """Yield hypotheses.
 
         Args:
-            recording: as it is read, or with some conventions corrected.
-            suspects: joints whose own conventions are questioned. Conventions of the whole log are
-                questioned where at least half of the joints are suspects.
+            recording: Recording as read, or with some conventions corrected.
+            suspects: Joints whose own conventions are tested. Conventions of the whole log are
+                tested if at least half of the joints are suspects.
         """
         suspects = [joint for joint in suspects if joint.channels]
         for joint in suspects:
@@ -216,7 +215,7 @@ class HypothesisGenerator:
         yield from _late_commands(recording)
 
     def _units_of_log(self, recording: Recording) -> Iterator[ConventionHypothesis]:
-        """Yield units that all signals of a kind may have."""
+        """Yield other units for all signals of a kind."""
         positions = self._channels("q")
         commands = [name for joint in self.joints for name in joint.servo_inputs]
         groups = positions, commands, [*positions, *commands], self._channels("qd")
@@ -288,7 +287,7 @@ def _zeros(joint: JointSignals, recording: Recording) -> Iterator[ConventionHypo
 
 
 def _wraps(joints: Sequence[JointSignals], recording: Recording) -> Iterator[ConventionHypothesis]:
-    """Yield positions that leave whole turns out."""
+    """Yield positions from which whole turns are missing."""
     for joint in joints:
         name = joint.channels.get("q")
         if name is None or not joint.is_hinge:
@@ -312,8 +311,8 @@ def _orders(
 ) -> Iterator[ConventionHypothesis]:
     """Yield other orders of the joints: of channels, of commands, and of both.
 
-    Pairs of suspects are exchanged; whole orders are the alphabetical one, the reversed one, and
-    that in which positions follow commands best.
+    Pairs of suspects are exchanged. Whole orders are the alphabetical one, the reversed one, and
+    the one in which positions follow commands best.
     """
     numbers = range(len(joints))
     has_commands = all(len(joint.inputs) == 1 for joint in joints)
@@ -363,7 +362,7 @@ def _order_of_commands(joints: Sequence[JointSignals], recording: Recording) -> 
 
 
 def _units(signals: Sequence[Signal], recording: Recording) -> Iterator[ConventionHypothesis]:
-    """Yield other units of signals that share one, and ticks where all numbers are whole."""
+    """Yield other units of signals that share one, and encoder ticks if all values are integers."""
     first = signals[0]
     names = [signal.name for signal in signals]
     text = listed(names, MAX_NAMED)
@@ -388,7 +387,7 @@ def _units(signals: Sequence[Signal], recording: Recording) -> Iterator[Conventi
 
 
 def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
-    """Return whether all numbers of these columns are whole."""
+    """Return whether all values of these columns are integers."""
     for run in recording.training():
         recorded = {**run.inputs, **run.channels}
         for signal in signals:
@@ -400,7 +399,7 @@ def _are_whole(signals: Sequence[Signal], recording: Recording) -> bool:
 
 
 def _late_commands(recording: Recording) -> Iterator[ConventionHypothesis]:
-    """Yield commands that are stamped late, so that the robot answers before them."""
+    """Yield delays of command time stamps: the robot responds before them."""
     run = recording.runs[0]
     if not run.inputs or run.times.size < 2:
         return

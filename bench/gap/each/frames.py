@@ -1,4 +1,4 @@
-"""Many logs as tables: a row a log, and a row for each number of each cause."""
+"""Tables over many logs: one row per log, and one row per number of each cause."""
 
 from __future__ import annotations
 
@@ -16,16 +16,21 @@ from bench.gap.each.rows import Row, named, table
 from bench.gap.report.words import labelled
 
 REPORT = "report.html"
-"""The page of a log in its folder, and that of all logs above."""
+"""File name of a log's report in its folder, and of the summary page of all logs."""
 LONGEST_NAME = 80
-"""Characters of the name of a number that are shown."""
+"""Maximum number of characters of a number's name that are shown."""
 _TEXTS = ("log", "verdict", "causes", "error", "report")
 _MEASURED = ("gap_closed", "low", "high", "before", "after", "seconds")
-"""Columns of the table of logs."""
+"""Numeric columns of the table of logs."""
 
 
 def logs(rows: Sequence[Row], folders: Mapping[str, Path]) -> pd.DataFrame:
-    """A row a log: what it says, where its report is, what is closed of its gap."""
+    """Build a table with one row per log: its causes, its report and the share of the gap closed.
+
+    Args:
+        rows: Result of each log.
+        folders: Folder of each log's explanation, by log.
+    """
     lines = []
     for place, row in enumerate(rows, start=1):
         folder = folders[row.log]
@@ -44,7 +49,7 @@ def logs(rows: Sequence[Row], folders: Mapping[str, Path]) -> pd.DataFrame:
 
 
 def written(rows: Sequence[Row]) -> pd.DataFrame:
-    """The table beside the page, as its text has it: names that look like numbers stay names."""
+    """Read the text of logs.csv as a table; names that look like numbers stay text."""
     head, *lines = csv.reader(StringIO(table(rows)))
     frame = pd.DataFrame(lines, columns=head)
     for name in ("value", "low", "high", "gap_closed", "seconds"):
@@ -53,7 +58,7 @@ def written(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def _held_out_of(folder: Path) -> dict[str, float]:
-    """The numbers of a log's held-out runs in its verdict; none where it cannot be read."""
+    """Read the held-out errors from a log's verdict.json; empty if it cannot be read."""
     try:
         said = json.loads((folder / "verdict.json").read_text(encoding="utf-8"))["heldout"]
         return {key: value for key, value in said.items() if isinstance(value, (int, float))}
@@ -62,19 +67,19 @@ def _held_out_of(folder: Path) -> dict[str, float]:
 
 
 def _floors(error: Mapping[str, float], key: str) -> float | None:
-    """A held-out error in noise floors."""
+    """Convert a held-out error to noise floors."""
     value, floor = error.get(key), error.get("noise_floor")
     return value / floor if value is not None and floor else None
 
 
 def place_of(name: str) -> str:
-    """Name a number of a cause: ``at elbow`` for ``coefficient@elbow``."""
+    """Format the place of a coefficient: ``at elbow`` for ``coefficient@elbow``."""
     coefficient, at, place = name.partition("@")
     return f"at {place}" if at and coefficient == "coefficient" else name
 
 
 def numbers(rows: Sequence[Row]) -> pd.DataFrame:
-    """A row for each number of each cause of a log, those of the commonest cause first."""
+    """Build a table with one row per number of each cause, those of the commonest cause first."""
     lines = []
     for place, row in enumerate(rows, start=1):
         for cause in row.causes:

@@ -1,4 +1,4 @@
-"""The page of many logs that were explained each by itself: report.html beside logs.csv."""
+"""HTML page of many logs that are explained separately: report.html next to logs.csv."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from sims.base import InputError
 from sims.files import write
 
 _NAMED_LETTERS = 120
-"""Characters of the names of all logs that stand on an axis; of more, their numbers do."""
+"""Maximum total number of characters of log names on an axis; with more, the logs are numbered."""
 _SAID = 6
-"""Causes, and logs without an answer, that are told before the tables."""
+"""Maximum number of causes, and of failed logs, that are listed before the tables."""
 _ORDER = ("named", "ambiguous", "partial", "adequate", "unknown", "unidentifiable")
 _BEFORE = style.drawn(style.VERMILION, (), "s")
 _AFTER = style.drawn(style.BLUE, (), "o")
@@ -35,14 +35,14 @@ _AFTER = style.drawn(style.BLUE, (), "o")
 
 @dataclass(frozen=True)
 class Asked:
-    """What the page is of, besides the rows.
+    """Input of the page in addition to the result rows.
 
     Attributes:
-        out: the folder of all.
-        folders: by log where its explanation lies.
-        recordings: by log the recording.
-        words: of the command that goes on with what is left.
-        left: logs that are not explained yet.
+        out: Output folder of the batch.
+        folders: Folder of each log's explanation, by log.
+        recordings: Path of each recording, by log.
+        words: Words of the command that continues the batch.
+        left: Number of logs that are not explained yet.
     """
 
     out: Path
@@ -53,10 +53,17 @@ class Asked:
 
 
 def write_page(rows: Sequence[Row], asked: Asked) -> Path:
-    """Write the page beside the table.
+    """Write the page next to the table.
+
+    Args:
+        rows: Result of each log.
+        asked: Input of the page in addition to the rows.
 
     Returns:
-        Where it is.
+        Path of the page.
+
+    Raises:
+        InputError: The page cannot be written.
     """
     path = asked.out / frames.REPORT
     try:
@@ -67,11 +74,11 @@ def write_page(rows: Sequence[Row], asked: Asked) -> Path:
 
 
 def each_page(rows: Sequence[Row], asked: Asked) -> str:
-    """The page as HTML: what was found in how many logs, then log by log.
+    """Render the page as HTML: a summary of the causes over all logs, then the logs one by one.
 
     Args:
-        rows: what came of each log, in the order given.
-        asked: what they were asked with.
+        rows: Result of each log, in the order given.
+        asked: Input of the page in addition to the rows.
     """
     logs = frames.logs(rows, asked.folders)
     found = frames.numbers(rows)
@@ -96,7 +103,7 @@ def _counted(count: int) -> str:
 def _conclusion(
     rows: Sequence[Row], logs: pd.DataFrame, found: pd.DataFrame, asked: Asked
 ) -> Iterator[str]:
-    """Verdicts, the commonest causes, what they close, what is left."""
+    """Yield sentences on verdicts, the commonest causes, the gap closed and the missing logs."""
     words = Counter(row.verdict for row in rows if row.verdict)
     said = [f"{words[word]} {safe(word)}" for word in _ORDER if words[word]]
     said += [f"{count} {safe(word)}" for word, count in words.items() if word not in _ORDER]
@@ -122,7 +129,7 @@ def _conclusion(
 
 
 def _spans(found: pd.DataFrame) -> str:
-    """Between what each number of a cause lies: ``: 0.3 to 0.7 N``."""
+    """Format the range of each coefficient of a cause, such as ``: 0.3 to 0.7 N``."""
     parts = []
     for name, mine in found.groupby("name", sort=False):
         ends = dict.fromkeys(number(end) for end in (mine["value"].min(), mine["value"].max()))
@@ -132,7 +139,7 @@ def _spans(found: pd.DataFrame) -> str:
 
 
 def _next(rows: Sequence[Row], asked: Asked) -> Iterator[str]:
-    """What is to be mended, what goes on, and what many logs of one cause are good for."""
+    """Yield the next steps: logs to repair or continue, and logs to explain together."""
     failed = [row for row in rows if row.error]
     if failed:
         yield paragraph(strong("Not explained:"))
@@ -175,7 +182,7 @@ def _each_grid() -> Grid:
 
 
 def _across(logs: pd.DataFrame) -> Axis:
-    """The logs along an axis."""
+    """Make the axis of the logs."""
     if not _has_names(logs):
         ends = (0.5, len(logs) + 0.5)
         return Axis("log, by its number", scales=("linear",), ends=ends)
@@ -183,18 +190,18 @@ def _across(logs: pd.DataFrame) -> Axis:
 
 
 def _has_names(logs: pd.DataFrame) -> bool:
-    """Whether the names of the logs have room along an axis."""
+    """Return whether the names of the logs fit on an axis."""
     names = [str(name) for name in logs["log"]]
     return len(names) * max(map(len, names), default=0) <= _NAMED_LETTERS
 
 
 def _placed(frame: pd.DataFrame, logs: pd.DataFrame) -> pd.DataFrame:
-    """With the place along the axis: named ones stand at 0, 1, 2, ..."""
+    """Add the position on the axis; named logs have the positions 0, 1, 2, ..."""
     return frame.assign(place=frame["number"] - (1 if _has_names(logs) else 0))
 
 
 def _found(page: Page, logs: pd.DataFrame, found: pd.DataFrame) -> Iterator[str]:
-    """Each number over the logs, and the table of all."""
+    """Yield the chart of each number over the logs, and the table of all numbers."""
     columns = (
         Column("log"),
         Column("verdict"),
@@ -222,7 +229,7 @@ def _found(page: Page, logs: pd.DataFrame, found: pd.DataFrame) -> Iterator[str]
     )
     if len(panels) > PANELS:
         caption += f" In print the {PANELS} commonest numbers."
-    # Many side by side are none that one could compare.
+    # Too many panels next to each other cannot be compared.
     beside = "number" if len(panels) <= PANELS else ""
     still = _still(numbers(logs, found), "Each number of the causes over the logs.", "numbers")
     title = "What each log gives"
@@ -232,7 +239,7 @@ def _found(page: Page, logs: pd.DataFrame, found: pd.DataFrame) -> Iterator[str]
 
 
 def _held_out(page: Page, logs: pd.DataFrame) -> str:
-    """Errors on held-out runs before and after, in noise floors."""
+    """Chart the errors on held-out runs before and after, in noise floors."""
     measured = logs[logs[["before", "after"]].map(lambda x: isfinite(x) and x > 0).all(axis=1)]
     if measured.empty:
         return ""

@@ -1,4 +1,4 @@
-"""What came of each of many logs: a row each, the table of all, and what all say together."""
+"""Result rows of many logs, the table of all logs and a summary of their causes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from bench.pages.csv_text import csv_text
 
 TABLE = "logs.csv"
-"""The table: a row for each number of each cause of each log."""
+"""File name of the table, which has one row for each number of each cause of each log."""
 HEAD = (
     "log", "verdict", "cause", "alternatives", "coefficient", "value", "low", "high", "unit",
     "gap_closed", "seconds", "error",
@@ -18,16 +18,16 @@ HEAD = (
 
 @dataclass(frozen=True)
 class Row:
-    """What came of a log.
+    """Result of one log.
 
     Attributes:
-        log: its name.
-        digest: that of `Log`.
-        verdict: the word; empty where it could not be explained.
-        causes: as verdict.json has them.
-        gap_closed: share of the held-out gap that is closed; None where nothing is held out.
-        seconds: that it took.
-        error: why it could not be explained, in one line.
+        log: Name of the log.
+        digest: Digest of the log's files and settings, see `Log`.
+        verdict: Verdict in one word; empty if the log could not be explained.
+        causes: Causes as in verdict.json.
+        gap_closed: Share of the held-out gap that is closed; None without held-out runs.
+        seconds: Duration of the diagnosis in seconds.
+        error: Reason why the log could not be explained, in one line.
     """
 
     log: str
@@ -40,12 +40,12 @@ class Row:
 
 
 def named(cause: Mapping[str, Any]) -> str:
-    """A cause with what cannot be told from it: ``friction.coulomb or joint.backlash``."""
+    """Format a cause with its alternatives: ``friction.coulomb or joint.backlash``."""
     return " or ".join([cause["effect"], *cause["alternatives"]])
 
 
 def table(rows: Sequence[Row]) -> str:
-    """The table of all logs as CSV, a row for each number of each cause."""
+    """Format the table of all logs as CSV, with one row for each number of each cause."""
     lines: list[tuple[object, ...]] = []
     for row in rows:
         cells: list[tuple[object, ...]] = []
@@ -59,7 +59,10 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def told(rows: Sequence[Row]) -> list[str]:
-    """How often each cause was named, and its numbers' range over the logs; most frequent first."""
+    """Summarise how often each cause was found, and the range of its numbers.
+
+    The most frequent cause comes first.
+    """
     places: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
         for cause in row.causes:

@@ -1,7 +1,7 @@
-"""Many recordings, each explained by itself: a folder for each, and one table of all of them.
+"""Explain many recordings separately: one folder for each, and one table of all.
 
-Whatever makes the calls makes them in any order, here or on a cluster; a log that cannot be
-explained is a row with its reason, and costs no other one.
+The calls may run in any order, locally or on a cluster. A log that cannot be explained becomes a
+row with the reason and does not affect the others.
 """
 
 from __future__ import annotations
@@ -25,19 +25,18 @@ from sims.base import InputError
 from sims.files import first_line, refuse_full, write
 
 STATE = "logs.json"
-"""What is known of the logs: it is written again whenever one is done."""
+"""File name of the batch state, which is rewritten whenever a log is done."""
 
 
 @dataclass(frozen=True)
 class Log:
-    """A recording, and where what is found about it goes.
+    """Recording of a batch, with its output folder.
 
     Attributes:
-        name: short, and no other log's.
-        path: of its table or description.
-        folder: for verdict, extended simulator, figures and report.
-        digest: of its files, those that its description maps among them, and of what it is asked
-            with.
+        name: Short name that is unique in the batch.
+        path: Path of its table or description.
+        folder: Folder for verdict, extended simulator, figures and report.
+        digest: Digest of its files, including those in its description, and of the settings.
     """
 
     name: str
@@ -47,15 +46,15 @@ class Log:
 
 
 def logs_of(paths: Sequence[Path], out: Path, settings: Mapping[str, Any]) -> list[Log]:
-    """The logs with their names and folders.
+    """List the logs with their names and folders.
 
     Args:
-        paths: of the recordings.
-        out: the folder of all.
-        settings: arguments of `explain`, and its ``budget`` in seconds.
+        paths: Paths of the recordings.
+        out: Output folder of the batch.
+        settings: Arguments of `explain`, and its ``budget`` in seconds.
 
     Raises:
-        InputError: a file is not there.
+        InputError: A file does not exist.
     """
     told = repr(sorted((key, str(value)) for key, value in settings.items()))
     if settings.get("model") is not None:
@@ -77,18 +76,22 @@ def explain_each(
     """Explain every log that is not explained yet, and write the table of all.
 
     Args:
-        logs: which.
-        out: the folder of all; what an earlier call has left there is not made again.
-        settings: those of `logs_of`.
-        pool: makes the calls.
-        done: told of each log as it ends.
-        stop: asked after each log; True leaves the others for another call.
+        logs: Logs of the batch.
+        out: Output folder of the batch; results of an earlier call in it are reused.
+        settings: Settings as for `logs_of`.
+        pool: Worker pool that makes the calls.
+        done: Callback that receives the result of each log.
+        stop: Function that is called after each log; if it returns True, the other logs remain for
+            another call.
+
+    Returns:
+        Results in the order of the logs.
     """
     rows = _known(out, logs)
     for row in rows.values():
         done(row)
     left = [log for log in logs if log.name not in rows]
-    # A worker process does not know what this one was asked to draw.
+    # A worker process does not know the figure settings of this process.
     calls = [(explained, (log, dict(settings), is_pdf_wanted())) for log in left]
     for place, result in pool.results(calls, np.inf):
         log = left[place]
@@ -105,7 +108,13 @@ def explain_each(
 
 
 def explained(log: Log, settings: Mapping[str, Any], pdf: bool = False) -> Row:
-    """Explain a log and write what was found, in whichever process makes the call."""
+    """Explain a log and write its results, in any process.
+
+    Args:
+        log: Log to explain.
+        settings: Settings as for `logs_of`.
+        pdf: Also write each figure as PDF.
+    """
     try:
         given = {key: value for key, value in settings.items() if key != "budget"}
         explanation = explain(log.path, watch=Watch(settings.get("budget")), **given)
@@ -120,13 +129,13 @@ def explained(log: Log, settings: Mapping[str, Any], pdf: bool = False) -> Row:
 
 
 def _said(error: object) -> str:
-    """One line about what ended a call."""
+    """Format the error that ended a call in one line."""
     said = first_line(error) if isinstance(error, BaseException) else "no result"
     return said if isinstance(error, InputError) else f"{type(error).__name__}: {said}"
 
 
 def _known(out: Path, logs: Sequence[Log]) -> dict[str, Row]:
-    """What an earlier call has found about the same files with the same settings."""
+    """Load the results of an earlier call for unchanged files and settings."""
     path = out / STATE
     if not path.exists():
         refuse_full(out)
@@ -144,7 +153,7 @@ def _known(out: Path, logs: Sequence[Log]) -> dict[str, Row]:
 
 
 def _write(out: Path, rows: Sequence[Row]) -> None:
-    """The state, and the table."""
+    """Write the batch state and the table."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         write(out / STATE, json.dumps([asdict(row) for row in rows], indent=1) + "\n")

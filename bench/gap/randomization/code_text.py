@@ -1,4 +1,4 @@
-"""Parts of generated Python code that are made of names from files."""
+"""Parts of generated Python code that contain names from files."""
 
 from __future__ import annotations
 
@@ -9,22 +9,27 @@ from bench.pages.text import clean
 from sims.extended import Extended
 
 WIDTH = 96
-"""Characters of a comment line."""
+"""Maximum number of characters of a comment line."""
 
 
 def literal(text: str) -> str:
-    """A text from a file as a Python literal in ASCII: it cannot end early or become code."""
+    """Format text from a file as an ASCII Python literal that cannot end early or become code."""
     plain = not {"'", '"'} & set(text)
     return f'"{ascii(text)[1:-1]}"' if plain else ascii(text)
 
 
 def number(value: float) -> str:
-    """A number as a Python literal, with nine digits."""
+    """Format a number as a Python literal with nine digits."""
     return repr(float(f"{value:.9g}"))
 
 
 def comment(text: str, indent: str = "") -> Iterator[str]:
-    """Lines of a comment; line breaks and control characters in names are spelled out."""
+    """Yield the lines of a comment; line breaks and control characters in names are escaped.
+
+    Args:
+        text: Text of the comment.
+        indent: Indentation of the lines.
+    """
     words = clean(text, 2000).split(" ")
     line = f"{indent}#"
     for word in words:
@@ -36,7 +41,7 @@ def comment(text: str, indent: str = "") -> Iterator[str]:
 
 
 def identifiers(names: Iterable[str]) -> Iterator[str]:
-    """An identifier for each name, different from all before it."""
+    """Yield an identifier for each name that differs from all earlier ones."""
     used: set[str] = set()
     for name in names:
         base = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_").lower() or "range"
@@ -50,7 +55,13 @@ def identifiers(names: Iterable[str]) -> Iterator[str]:
 
 
 def heading(extended: Extended, framework: str, left_out: Iterable[str]) -> Iterator[str]:
-    """The first lines of a file: what it is of, and what it lacks."""
+    """Yield the first lines of a file: its origin, and the ranges that are left out.
+
+    Args:
+        extended: Extended simulator with the numbers.
+        framework: Name of the framework.
+        left_out: Reasons for ranges that are left out.
+    """
     model = extended.robot.path.name if extended.robot is not None else extended.system
     yield from comment(
         f"Domain randomisation for {framework}, written by simgap explain --ranges: robot "

@@ -1,4 +1,4 @@
-"""The files of `simgap explain --ranges`: ranges.toml, ranges.csv and code for two frameworks."""
+"""Files of `simgap explain --ranges`: ranges.toml, ranges.csv and code for two frameworks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bench.pages.csv_text import csv_text
 from sims.extended import Extended
 
 FORMAT = 1
-"""Version of ranges.toml."""
+"""Format version of ranges.toml."""
 COLUMNS = (
     "cause", "coefficient", "source", "kind", "name", "field", "address", "sign", "unit",
     "nominal", "value", "low", "high", "operation", "minimum", "maximum",
@@ -24,13 +24,14 @@ COLUMNS = (
 def range_files(
     ranges: RandomizationRanges, extended: Extended, folder: Path | None = None
 ) -> Mapping[str, str]:
-    """Return the content of each file by its name: none where there is no range, and no code where
-    no field of the model holds a number.
+    """Return the content of each file by its name.
+
+    Without ranges there are no files, and without model fields for the numbers there is no code.
 
     Args:
-        ranges: to write.
-        extended: whose numbers they are.
-        folder: in which the files will lie: from there the model file is named.
+        ranges: Ranges to write.
+        extended: Extended simulator with the numbers.
+        folder: Folder of the files; the path of the model file is relative to it.
     """
     if not ranges.ranges:
         return {}
@@ -58,7 +59,7 @@ def range_files(
 
 
 def _cell(value: Any) -> object:
-    """A value as a cell: an address as numbers with spaces between; nothing for what is absent."""
+    """Format a value as a cell: an address as numbers with spaces, a missing value as empty."""
     if isinstance(value, list):
         return " ".join(str(number) for number in value)
     return "" if value is None else value

@@ -1,10 +1,11 @@
 """Ranges as event terms of Isaac Lab.
 
-Terms of `isaaclab.envs.mdp` (source/isaaclab/isaaclab/envs/mdp/events.py of isaac-sim/IsaacLab):
-`randomize_joint_parameters`, `randomize_actuator_gains`, `randomize_rigid_body_mass`,
-`randomize_rigid_body_com`, `randomize_rigid_body_inertia` (since Isaac Lab 3) and
-`randomize_physics_scene_gravity`. Isaac Lab keeps stiffness and damping of a drive at its joint: a
-servo's gains are multiplied by the square of its gear, and the damping of the joint is added.
+The terms are functions of `isaaclab.envs.mdp` (source/isaaclab/isaaclab/envs/mdp/events.py of
+isaac-sim/IsaacLab): `randomize_joint_parameters`, `randomize_actuator_gains`,
+`randomize_rigid_body_mass`, `randomize_rigid_body_com`, `randomize_rigid_body_inertia` (since Isaac
+Lab 3) and `randomize_physics_scene_gravity`. Isaac Lab defines stiffness and damping of a drive at
+its joint. The gains of a servo are therefore multiplied by the square of its gear, and the damping
+of the joint is added.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ AXES = "xyz"
 
 
 class Term(NamedTuple):
-    """An event term: its name, function and parameters as code, and comments before it."""
+    """Event term: its name, function and parameters as code, and comments before it."""
 
     name: str
     function: str
@@ -46,7 +47,13 @@ class Term(NamedTuple):
 
 
 def isaac_lab_code(ranges: RandomizationRanges, extended: Extended, robot: Any) -> str:
-    """Return a Python file with a configclass of event terms."""
+    """Return a Python file with a configclass of event terms.
+
+    Args:
+        ranges: Ranges to write.
+        extended: Extended simulator with the numbers.
+        robot: Robot with its compiled model.
+    """
     said = dict(texts(ranges))
     terms, missing = _terms(ranges, said, robot)
     lines = [*heading(extended, "Isaac Lab", ranges.left_out)]
@@ -79,7 +86,7 @@ def _written(name: str, term: Term) -> Iterator[str]:
 def _terms(
     ranges: RandomizationRanges, said: Mapping[RandomizationRange, str], robot: Any
 ) -> tuple[list[Term], list[RandomizationRange]]:
-    """The terms, and the ranges for which there is none."""
+    """Build the terms, and list the ranges for which there is no term."""
     by_effect: dict[str, dict[str, list[RandomizationRange]]] = {}
     for one in ranges.ranges:
         by_effect.setdefault(one.effect, {}).setdefault(one.name, []).append(one)
@@ -97,7 +104,7 @@ def _terms(
     for name, (one,) in by_effect.pop("mass.scale", {}).items():
         params = {"mass_distribution_params": _pair(*_ends(one)), "operation": '"abs"'}
         if name in by_effect.get("inertia.scale", {}):
-            # The range of the inertia holds the scaling by the mass.
+            # The range of the inertia already includes the scaling by the mass.
             params["recompute_inertia"] = "False"
         terms.append(
             _body_term("body_mass", name, "randomize_rigid_body_mass", params, [said[one]])
@@ -125,7 +132,7 @@ def _gains(
     said: Mapping[RandomizationRange, str],
     robot: Any,
 ) -> Iterator[Term]:
-    """Terms of stiffness and damping at joints."""
+    """Yield the terms of stiffness and damping at joints."""
     stiffness = by_effect.pop("actuator.stiffness", {})
     damping = by_effect.pop("actuator.damping", {})
     passive = by_effect.pop("drag.linear", {})
@@ -148,7 +155,7 @@ def _gains(
 
 
 def _by_joint(robot: Any, found: Mapping[str, Any]) -> dict[str, list[str]]:
-    """All actuators of the joints at which one of some actuators acts."""
+    """Return all actuators of each joint at which one of the given actuators acts."""
     joints = dict.fromkeys(robot.actuator(name).joint for name in found)
     return {j: [one.name for one in robot.actuators if one.joint == j] for j in joints if j}
 
@@ -156,7 +163,7 @@ def _by_joint(robot: Any, found: Mapping[str, Any]) -> dict[str, list[str]]:
 def _at_joint(
     robot: Any, found: Mapping[str, Sequence[RandomizationRange]], name: str, term: int
 ) -> tuple[float, float]:
-    """A gain of an actuator as its joint has it, from low to high."""
+    """Return the interval of an actuator's gain, converted to its joint."""
     number_ = robot.actuator(name).id
     share = float(robot.compiled.actuator_gear[number_, 0]) ** 2
     if name in found:
@@ -171,7 +178,7 @@ def _gravity(
     said: Mapping[RandomizationRange, str],
     robot: Any,
 ) -> Iterator[Term]:
-    """The term of gravity: all of its components."""
+    """Yield the term of gravity, which sets all components."""
     scale = [one for own in by_effect.pop("gravity.scale", {}).values() for one in own]
     tilt = [one for own in by_effect.pop("gravity.tilt", {}).values() for one in own]
     if not scale and not tilt:
@@ -219,7 +226,7 @@ def _body_term(
 
 
 def _asset(key: str, name: str) -> str:
-    """The asset with one joint or body; Isaac Lab reads names as regular expressions."""
+    """Format the asset with one joint or body; Isaac Lab reads names as regular expressions."""
     return f'SceneEntityCfg("robot", {key}=[{literal(re.escape(name))}])'
 
 

@@ -3,7 +3,8 @@
 Such a function takes the model of MJX and one random key for each environment. It returns the model
 with a leading axis in the fields that it sets, and `in_axes` for `jax.vmap`
 (mujoco_playground/_src/locomotion/go1/randomize.py of google-deepmind/mujoco_playground). All
-numbers are absolute, so that the function suits the original model file and extended.xml.
+numbers are absolute, so that the function can be used with the original model file and with
+extended.xml.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from bench.gap.randomization.ranges import RandomizationRange, RandomizationRang
 from sims.extended import Extended
 
 OBJECTS = {"joint": "mjOBJ_JOINT", "body": "mjOBJ_BODY", "actuator": "mjOBJ_ACTUATOR"}
-"""MuJoCo's types of objects, by kind of place."""
+"""MuJoCo's object types by kind of place."""
 IMPORTS = """
 import jax
 import jax.numpy as jp
@@ -36,9 +37,16 @@ def domain_randomize(model: mjx.Model, rng: jax.Array):
 
 
 def mujoco_playground_code(ranges: RandomizationRanges, extended: Extended, robot: Any) -> str:
-    """Return a Python file with a function `domain_randomize`."""
+    """Return a Python file with a function `domain_randomize`.
+
+    Args:
+        ranges: Ranges to write.
+        extended: Extended simulator with the numbers.
+        robot: Robot with its compiled model.
+    """
     said = dict(texts(ranges))
-    # Inertia is set after the mass, which scales it too, and components of gravity after its size.
+    # Setting the mass also scales the inertia, and setting the size of gravity its components, so
+    # inertia and components are set afterwards.
     set_ranges = sorted((one for one in ranges.ranges if one.fields), key=_is_last)
     names = list(dict.fromkeys(name for one in set_ranges for name in _fields(one)))
     lines = [*heading(extended, "MuJoCo Playground", ranges.left_out)]
@@ -79,7 +87,7 @@ def _is_last(one: RandomizationRange) -> bool:
 
 
 def _fields(one: RandomizationRange) -> Iterator[str]:
-    """Fields that a range sets."""
+    """Yield the names of the fields that a range sets."""
     yield from dict.fromkeys(field.name for field in one.fields)
     if one.effect == "mass.scale":
         yield "body_inertia"
@@ -90,7 +98,7 @@ def _variable(field: str) -> str:
 
 
 def _draw(one: RandomizationRange, place: str, robot: Any) -> Iterator[str]:
-    """Draw a number and set it in the fields."""
+    """Yield code that draws a number and sets it in the fields."""
     ends = f"minval={number(one.low)}, maxval={number(one.high)}"
     yield "    rng, key = jax.random.split(rng)"
     yield f"    value = jax.random.uniform(key, {ends})"
@@ -119,7 +127,7 @@ def _draw(one: RandomizationRange, place: str, robot: Any) -> Iterator[str]:
 
 
 def _index(one: RandomizationRange, place: str, address: tuple[int, ...]) -> str:
-    """The index of an element, by the number of its joint, body or actuator."""
+    """Format the index of an element, based on the variable of its joint, body or actuator."""
     if not place:
         return ", ".join(str(k) for k in address)
     first = f"model.jnt_dofadr[{place}]" if one.field.startswith("dof_") else place

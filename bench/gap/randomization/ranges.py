@@ -1,5 +1,7 @@
-"""Ranges for domain randomisation: of each number of a robot's model file that was found to be
-wrong, or was freed, the 95 % interval of the number that the file then has.
+"""Ranges for domain randomisation of the numbers of a robot's model file.
+
+For each number that a diagnosed cause changes, or that was freed, the range is the 95 % interval of
+its resulting value in the model file.
 """
 
 from __future__ import annotations
@@ -31,22 +33,22 @@ NO_FIELD = (
 
 @dataclass(frozen=True)
 class RandomizationRange:
-    """The range of one number of a robot.
+    """Range of one number of a robot.
 
     Attributes:
-        cause: effect and place, as ``friction.coulomb@elbow``.
-        coefficient: its coefficient, as ``coefficient`` or ``x``.
-        is_free: whether the user freed the number; else it is of a named cause.
+        cause: Effect and place, such as ``friction.coulomb@elbow``.
+        coefficient: Coefficient of the effect, such as ``coefficient`` or ``x``.
+        is_free: Whether the user freed the number; otherwise it belongs to a diagnosed cause.
         kind: joint, actuator, body, channel or world.
-        name: of the joint, actuator, body or channel; empty for the world.
-        fields: elements of the compiled model that hold the number, the main one first; empty where
-            the model has no such number: then all numbers are those of the effect's coefficient.
-        unit: of nominal, value, low and high.
-        nominal: what the model file states; None where it states nothing.
-        value: the number with the effect.
-        low, high: 95 % interval of the number with the effect, all others at their estimates.
+        name: Name of the joint, actuator, body or channel; empty for the world.
+        fields: Elements of the compiled model that contain the number, the main one first; empty if
+            the model has no such number, so that all values are those of the coefficient.
+        unit: Unit of nominal, value, low and high.
+        nominal: Value in the model file; None if the file has none.
+        value: Value with the effect.
+        low, high: 95 % interval of the value with the effect, with all others at their estimates.
         operation: ``abs``, ``add`` or ``scale``.
-        minimum, maximum: ends of the uniform distribution to draw from, for the operation.
+        minimum, maximum: Limits of the uniform distribution to draw from, for the operation.
     """
 
     cause: str
@@ -71,11 +73,11 @@ class RandomizationRange:
 
     @property
     def field(self) -> str:
-        """Name of the main field of the compiled model; empty where it has none."""
+        """Name of the main field of the compiled model; empty if there is none."""
         return self.fields[0].name if self.fields else ""
 
     def document(self) -> dict[str, Any]:
-        """As in ranges.toml and in the JSON of the command; TOML has no null."""
+        """Return the range as in ranges.toml and in the command's JSON; TOML has no null."""
         found: dict[str, Any] = {
             "cause": self.cause,
             "coefficient": self.coefficient,
@@ -94,11 +96,11 @@ class RandomizationRange:
 
 
 class RandomizationRanges(NamedTuple):
-    """Ranges of a robot's numbers, and a line for each number that has none and for the whole.
+    """Ranges of a robot's numbers, and reasons for those that are left out.
 
     Attributes:
-        ranges: in the order of the causes.
-        left_out: what is left out and why, one line each.
+        ranges: Ranges in the order of the causes.
+        left_out: What is left out and why, one line each.
     """
 
     ranges: tuple[RandomizationRange, ...]
@@ -106,7 +108,7 @@ class RandomizationRanges(NamedTuple):
 
 
 class _Entry(NamedTuple):
-    """One coefficient of an effect at one place."""
+    """Coefficient of an effect at one place."""
 
     cause: Cause
     is_free: bool
@@ -114,16 +116,16 @@ class _Entry(NamedTuple):
 
 
 def randomization_ranges(answer: Verdict, extended: Extended) -> RandomizationRanges:
-    """Return the ranges of the fitted numbers of named causes and of free numbers.
+    """Return the ranges of the fitted numbers of diagnosed causes and of free numbers.
 
     Args:
-        answer: the verdict. A cause with alternatives is open, and is left out.
-        extended: the fitted numbers.
+        answer: Verdict. A cause with alternatives is ambiguous, and is left out.
+        extended: Extended simulator with the fitted numbers.
     """
     kind: Any = extended.kind
     if kind is None or not kind.has_model:
         return RandomizationRanges((), (NO_MODEL.format(system=f"system {extended.system}"),))
-    # Loaded for robots alone.
+    # This import is needed for robots only.
     from sims.robot.causes import one_by_one
 
     named = {cause.effect for cause in answer.causes if not cause.alternatives}
@@ -161,7 +163,7 @@ def randomization_ranges(answer: Verdict, extended: Extended) -> RandomizationRa
 
 
 def _reason(number: Number, entry: _Entry) -> str:
-    """Why a number has no range; empty where it has one."""
+    """Return why a number has no range; empty if it has one."""
     from sims.robot.causes import is_gravity_compensated
 
     name = entry.cause.name
@@ -180,7 +182,7 @@ def _reason(number: Number, entry: _Entry) -> str:
 
 
 class _Totals:
-    """Numbers of the model file with all effects, one of them moved."""
+    """Numbers of the model file with all effects applied, for changes of one coefficient."""
 
     def __init__(self, kind: Any, causes: list[Cause]) -> None:
         self.robot: Robot = kind.robot
@@ -191,8 +193,14 @@ class _Totals:
         ]
 
     def at(self, number: int, coefficient: str, value: float) -> tuple[float | None, float, str]:
-        """The number of the file before and after, and its unit, with a coefficient of one cause at
-        a value; the coefficient itself where the file has no such number.
+        """Return the file's number before and after, and its unit, for one changed coefficient.
+
+        If the file has no such number, they are None and the coefficient itself.
+
+        Args:
+            number: Index of the cause.
+            coefficient: Coefficient of the cause that is changed.
+            value: Value of the coefficient.
         """
         from sims.robot.totals import totals
 
@@ -214,7 +222,7 @@ def _value(numbers: Mapping[str, Number], coefficient: str) -> float:
 
 
 def _range(robot: Robot, totals: _Totals, number: int, entry: _Entry) -> RandomizationRange:
-    """The range of a number that has an interval."""
+    """Build the range of a number that has an interval."""
     from sims.robot.model_fields import model_fields, operation_of
 
     cause, fitted = entry.cause, entry.cause.numbers[entry.coefficient]
@@ -252,7 +260,7 @@ def _range(robot: Robot, totals: _Totals, number: int, entry: _Entry) -> Randomi
 
 
 def texts(ranges: RandomizationRanges) -> Iterator[tuple[RandomizationRange, str]]:
-    """Each range with a sentence about it: what, from where, to where."""
+    """Yield each range with a sentence that describes it."""
     for one in ranges.ranges:
         where = f"{one.kind} {one.name}" if one.name else "the world"
         what = one.field or f"effect {one.effect}"

@@ -1,6 +1,4 @@
-"""The account of an explanation in plain sentences: for the terminal, and what the page and the
-figures say too.
-"""
+"""Plain-text summary of an explanation, for the terminal, the page and the figures."""
 
 from __future__ import annotations
 
@@ -44,32 +42,36 @@ from bench.gap.verdict import Cause, Heldout, RecordingFault, Verdict
 from sims.base import Array
 
 WIDTH = 100
-"""Letters of a line on the terminal."""
+"""Maximum number of characters of a line on the terminal."""
 ESTIMATED = 1.2
-"""An estimated noise is known to this over the root of the number of samples, as a share of it (see
-`floor`).
+"""Relative standard error of an estimated noise, times the square root of the number of samples
+(see `bench.gap.model.floor`).
 """
 ONE_SIDED = 1.645
-"""Sigmas below which a normal variable lies with 95 %."""
+"""One-sided 95 % quantile of the normal distribution, in standard deviations."""
 MOST_PHI = 0.98
-"""Correlation of neighbouring samples that is believed at most: at 1 no sample would count."""
+"""Maximum correlation of neighbouring samples that is used; with 1 no sample would count."""
 FAR = 10.0
-"""Shares of its value by which a parameter moves that are no longer said in percent."""
+"""Relative change of a parameter above which it is not reported in percent."""
 MOST_CHANNELS = 6
-"""Channels that a sentence names."""
+"""Maximum number of channels that a sentence names."""
 PERFECT = "with a perfect model the sensor's noise would leave"
 MOVED = 0.05
-"""Relative change of a parameter that is reported as absorption where its interval is not known."""
+"""Minimum relative change of a parameter that is reported as absorption if its interval is unknown.
+"""
 LEAST_MOVE = 1e-3
-"""Relative change of a parameter below which it has absorbed nothing, however narrow its interval.
+"""Minimum relative change of a parameter that can be reported as absorption, however narrow its
+interval.
 """
 
 
 def account(story: Story) -> list[str]:
-    """The lines that a terminal shows: the verdict in a sentence, the gain, where, what moved, what
-    remains.
+    """Format the summary as terminal lines.
+
+    They contain the verdict in a sentence, the gain, the location of the gap, changed parameters,
+    and what remains unexplained.
     """
-    # The title comes from a file: it must not break the line, nor command the terminal.
+    # The title comes from a file: it must not contain line breaks or terminal control sequences.
     lines = [clean(story.title, WIDTH), ""]
     for text in (headline(story), *following(story)):
         lines += wrap(text, WIDTH)
@@ -79,53 +81,53 @@ def account(story: Story) -> list[str]:
 
 
 def details(story: Story) -> Iterator[str]:
-    """Paragraphs below the headline, a sentence or a few each."""
+    """Yield the paragraphs below the headline."""
     verdict = story.verdict.verdict
     if story.verdict.recording_faults:
         yield effort(story)
         return
-    # What an effect does is said above the details already in these two.
+    # For these verdicts, the description of an effect is part of the text above the details.
     explained = verdict in ("named", "partial")
     for cause in story.verdict.causes:
         name = f"{sentence(noun(cause.effect))[:-1]} ({clean(cause.effect, 60)})"
         says = "" if explained else f"{_says(cause)}; "
         yield f"{name}: {says}{coefficients(cause)}"
-    # The most important reasons come first; the page has all of them.
+    # The most important reasons come first; the page contains all of them.
     if story.why:
         yield "Why: " + " ".join(sentence(text) for text in story.why[:2])
     largest_places = [largest(story, kind) for kind in ("run", "channel", "phase")]
     places = [text for text in largest_places if text]
-    # Without a gap the largest of its parts is one of chance.
+    # Without a gap, the largest residual of a part is random.
     if places and verdict != "adequate":
         unit = "RMS in units of the noise (1 is the noise floor)"
         yield f"Where the gap is largest, {unit}: {'; '.join(places)}."
     if story.parameters:
         sentences = [moves(story, p) for p in story.parameters]
         yield "Parameters: " + " ".join(sentences)
-    # Of one log whose runs agree there is nothing to say.
+    # For a single log with consistent runs there is nothing to report.
     if any(not one.agree or one.by == "log" for one in (*story.apart.after, *story.apart.before)):
         yield "Which number to trust: " + " ".join(told(story))
     if story.remains:
         yield "What remains: " + " ".join(sentence(text) for text in story.remains)
-    # Where causes cannot be told apart the experiment stands right below the headline.
+    # For an ambiguous verdict, the experiment directly follows the headline.
     if verdict != "ambiguous" and (proposed := experiment(story)):
         yield f"Next experiment: {proposed}"
     yield effort(story)
 
 
 def _says(cause: Cause) -> str:
-    """What an effect does, to stand within a sentence."""
+    """Return the description of an effect, to be used within a sentence."""
     return without_place(clean(cause.says).rstrip("."))
 
 
 def headline(story: Story) -> str:
-    """What is wrong with the simulator, in one sentence."""
+    """Format in one sentence what is wrong with the simulator."""
     verdict, causes = story.verdict.verdict, story.verdict.causes
     if story.verdict.recording_faults:
         return sentence(story.verdict.recording_faults[0].says)
     if story.verdict.cut is not None:
         return _headline_of_cut(story.verdict)
-    # No cause is said to be lacking where the verdict does not vouch for it.
+    # A cause is reported as lacking only if the verdict supports it.
     if verdict == "adequate":
         return "Nothing is missing from the simulation that these data can show."
     if verdict == "unidentifiable":
@@ -153,7 +155,7 @@ def headline(story: Story) -> str:
             return sentence(f"{said}, and the simulation lacks {more}")
         return f"The simulation {lacks(causes)}, and {_also(causes)}{more}."
     if len(causes) > 1:
-        # With several causes the sentence would not end: what they do follows it.
+        # With several causes the sentence would be too long; their descriptions follow it.
         return f"The simulation {lacks([replace(c, alternatives=()) for c in causes])}."
     (cause,) = causes
     if said := sized(cause):
@@ -164,7 +166,7 @@ def headline(story: Story) -> str:
 
 
 def _undetermined(causes: Sequence[Cause]) -> str:
-    """Why causes are not named whose numbers are not results."""
+    """Explain why causes without result values are not confirmed."""
     numbers = [n for cause in causes for n in cause.open_numbers.values()]
     at_bounds = [n for n in numbers if n.at_bound is not None]
     if not at_bounds:
@@ -176,7 +178,7 @@ def _undetermined(causes: Sequence[Cause]) -> str:
 
 
 def undetermined(story: Story) -> Iterator[str]:
-    """Which numbers of the causes are not results, what that means, and what to do."""
+    """Yield which coefficients are not results, what that means, and what to do."""
     found = [
         (f"{clean(cause.effect, 60)}, {clean(key, 60)}", fitted)
         for cause in story.verdict.causes
@@ -205,13 +207,13 @@ def undetermined(story: Story) -> Iterator[str]:
 
 
 def _also(causes: Sequence[Cause]) -> str:
-    """The verb of what is lacking besides, where the causes before it are wrong numbers."""
+    """Return the verb before a missing effect that follows wrong values."""
     names = [name for cause in causes for name in (cause.effect, *cause.alternatives)]
     return "lacks " if any(is_wrong(name) for name in names) else ""
 
 
 def _headline_of_cut(verdict: Verdict) -> str:
-    """The same of a search that was ended early: what it has, and no more."""
+    """Format the headline of a search that was stopped early, with its preliminary result."""
     if verdict.verdict == "partial":
         return f"The simulation {lacks(verdict.causes)}; what else, was not asked to the end."
     nothing = "The search was ended before it could say what the simulation lacks"
@@ -221,7 +223,7 @@ def _headline_of_cut(verdict: Verdict) -> str:
 
 
 def cut(story: Story) -> str:
-    """What ended the search, and what was not asked any more; empty where it came to its end."""
+    """Format why the search stopped early and which questions it skipped; empty if complete."""
     found = story.verdict.cut
     if found is None:
         return ""
@@ -232,10 +234,12 @@ def cut(story: Story) -> str:
 
 
 def unfixed(story: Story) -> list[str]:
-    """Parameters that the recording cannot fix: those named so, else without interval, else not
-    touched, else all.
+    """List the parameters that the recording cannot identify.
+
+    They are those reported by the search, else those without interval, else insensitive ones, else
+    all.
     """
-    # Each list is the fallback of the one before: some parameter must be named.
+    # Each list is the fallback of the previous one, because at least one parameter must be named.
     unbounded = [p.name for p in story.parameters if p.touched and not np.isfinite(p.before).all()]
     untouched = [p.name for p in story.parameters if not p.touched]
     names = list(story.vague) or unbounded or untouched or [p.name for p in story.parameters]
@@ -243,7 +247,7 @@ def unfixed(story: Story) -> list[str]:
 
 
 def following(story: Story) -> Iterator[str]:
-    """The sentences that follow the headline at once: the gain, and what the verdict owes."""
+    """Yield the sentences directly after the headline: gain, caveats and required details."""
     verdict = story.verdict.verdict
     yield from (sentence(note) for note in story.verdict.recording_notes)
     if story.verdict.recording_faults:
@@ -251,14 +255,14 @@ def following(story: Story) -> Iterator[str]:
         return
     if story.verdict.cut is not None:
         yield cut(story)
-    # To find nothing says little without what was looked for, and what could not have been seen.
+    # A result without a cause needs the tested causes and the detectable gap as context.
     if verdict == "adequate":
         yield looked_for(story)
         yield hiding(story)
     yield gain(story)
     yield from undetermined(story)
     if verdict == "partial" or (verdict == "named" and len(story.verdict.causes) > 1):
-        # The headline says what a single named cause does; here the others have their turn.
+        # The headline describes a single diagnosed cause; several causes are described here.
         sayings = [
             sized(cause) or f"{noun(cause.effect)}: {_says(cause)}"
             for cause in story.verdict.causes
@@ -269,7 +273,7 @@ def following(story: Story) -> Iterator[str]:
 
 
 def _of_faults(faults: Sequence[RecordingFault]) -> Iterator[str]:
-    """What supports a wrong unit or sign, what else would explain the data, and what to do."""
+    """Yield the evidence for a wrong unit or sign, alternative explanations, and what to do."""
     first, *others = faults
     if first.error_after is not None:
         before = f"from {number(first.error_before)} " if first.error_before is not None else ""
@@ -283,8 +287,9 @@ def _of_faults(faults: Sequence[RecordingFault]) -> Iterator[str]:
 
 
 def gain(story: Story) -> str:
-    """The held-out error before and after against the floor; that it was not measured where no run
-    is held out.
+    """Format the held-out error before and after, and the noise floor.
+
+    Without held-out runs, the text says that the gain was not measured.
     """
     held_out = story.verdict.heldout
     if held_out is None:
@@ -293,7 +298,7 @@ def gain(story: Story) -> str:
     extended = _error(story, held_out.rmse_extended)
     perfect = f"{PERFECT} {_error(story, held_out.noise_floor)}"
     runs = story.validation_runs
-    # Without a cause the extended model is the base model: there is no after.
+    # Without a cause the extended model is the base model, so there is no error after.
     if not story.verdict.causes:
         return f"On {runs} the tuned simulation errs by {base} (RMSE); {perfect}."
     errors = f"the error on {runs} (RMSE) is {base} before and {extended} after; {perfect}."
@@ -304,12 +309,12 @@ def gain(story: Story) -> str:
 
 
 def closes(held_out: Heldout) -> bool:
-    """Whether a share of the gap is known."""
+    """Return whether the share of the gap closed is known."""
     return held_out.gap_closed is not None and isfinite(held_out.gap_closed)
 
 
 def interval(held_out: Heldout) -> str:
-    """`` (85 to 94 %)``, the 95 % interval of the share closed; empty where there is none."""
+    """Format the 95 % interval of the share closed: `` (85 to 94 %)``; empty without one."""
     low, high = held_out.low, held_out.high
     if low is None or high is None:
         return ""
@@ -317,7 +322,7 @@ def interval(held_out: Heldout) -> str:
 
 
 def _closer(story: Story) -> str:
-    """The beginning of the sentence that says how much of the gap is closed."""
+    """Return the beginning of the sentence about the share of the gap that is closed."""
     causes = story.verdict.causes
     if story.verdict.verdict == "unknown" and story.verdict.cut is None:
         names = joined([noun(cause.effect) for cause in causes])
@@ -347,13 +352,14 @@ def _fitted_gain(story: Story) -> str:
 
 
 def heldout_unit(story: Story) -> str:
-    """The unit of the held-out errors: stated, or that of the channels whose noise together makes
-    the floor.
+    """Return the unit of the held-out errors.
+
+    It is the specified unit, or that of the channels whose combined noise is the noise floor.
     """
     held_out = story.verdict.heldout
     if held_out is not None and held_out.unit:
         return held_out.unit
-    # Where it is not stated: the floor is the RMS of the noise of the channels of one unit.
+    # If the unit is not specified: the noise floor is the RMS noise of the channels of one unit.
     floor = held_out.noise_floor if held_out is not None else None
     units = list(dict.fromkeys(c.unit for c in story.channels))
     for unit in units:
@@ -369,7 +375,7 @@ def _error(story: Story, value: float | None) -> str:
 
 
 def looked_for(story: Story) -> str:
-    """What was looked for, and how close the best candidate comes."""
+    """Format the number of tested causes and the best candidate."""
     candidates = story.verdict.candidates
     if not candidates:
         return "No candidate causes were at hand."
@@ -382,11 +388,12 @@ def looked_for(story: Story) -> str:
 
 
 def hiding(story: Story) -> str:
-    """How large a gap the noise could hide, channel by channel; of many, in the worst of each
-    kind.
+    """Format how large a gap the noise could hide in each channel.
+
+    With many channels, only the worst one of each kind is reported.
     """
     sizes = zip(story.channels, hidden(story).tolist(), strict=True)
-    # A channel that was hardly recorded says nothing about what it hides.
+    # The detectable gap of a channel with too few samples is unknown.
     known = [(channel, size) for channel, size in sizes if isfinite(size)]
     parts = []
     for channel, size in _worst_of_each(known):
@@ -397,7 +404,7 @@ def hiding(story: Story) -> str:
 
 
 def _worst_of_each(sizes: Sequence[tuple[Shown, float]]) -> list[tuple[Shown, float]]:
-    """Of many channels the one of each kind that hides most, in units of its noise."""
+    """Select, from many channels, the one of each kind that hides most, in units of its noise."""
     if len(sizes) <= MOST_CHANNELS:
         return list(sizes)
     worst: dict[str, tuple[Shown, float]] = {}
@@ -409,18 +416,19 @@ def _worst_of_each(sizes: Sequence[tuple[Shown, float]]) -> list[tuple[Shown, fl
 
 
 def hidden(story: Story) -> Array:
-    """(C,) RMS in the channel's unit of the largest gap that a channel's noise could hide, at 95 %.
+    """Compute the largest gap (C,) that the noise of a channel could hide at 95 %.
 
-    With r the residuals in units of the noise, n of them, and s = mean(r^2), which is 1 without a
-    gap:
+    The gap is an RMS in the unit of the channel. r are the n residuals in units of the noise, and s
+    = mean(r^2), which is 1 without a gap:
 
-        phi = mean(r_t r_t+1) / s                                   (1)
-        n'  = n (1 - phi^2) / (1 + phi^2)                           (2)
-        gap^2 = max(0, s - 1) + 1.645 hypot(s sqrt(2 / n'), d)      (3)
+            phi = mean(r_t r_t+1) / s                                   (1)
+            n'  = n (1 - phi^2) / (1 + phi^2)                           (2)
+            gap^2 = max(0, s - 1) + 1.645 hypot(s sqrt(2 / n'), d)      (3)
 
-    Fewer samples count where the noise remembers: (2) is the number of independent ones whose mean
-    square is as uncertain as that of noise with the correlation phi^k over k samples. A noise that
-    is estimated is itself uncertain, by the share 1.2 / sqrt(n) and its square by d, twice as much.
+    Autocorrelated noise reduces the effective number of samples: (2) is the number of independent
+    samples whose mean square has the same variance as that of noise with the correlation phi^k over
+    k samples. An estimated noise has itself a relative error of 1.2 / sqrt(n); d is the error of
+    its square, twice as much.
     """
     sizes = []
     for c, channel in enumerate(story.channels):
@@ -428,12 +436,12 @@ def hidden(story: Story) -> Array:
         for side in sides(story):
             rows += [*((side.observed - side.before)[:, :, c] / channel.sigma)]
         residuals = np.concatenate([row[np.isfinite(row)] for row in rows])
-        # A single sample has no neighbour, and its square is no variance.
+        # A single sample has no neighbour, and its square is not a variance.
         if residuals.size < 2:
             sizes.append(np.nan)
             continue
         square = float(np.mean(residuals**2))
-        # Neighbours within a run, and none across a missing sample: their product is NaN.
+        # Products use neighbours within a run; a product with a missing sample is NaN.
         products = np.concatenate([row[1:] * row[:-1] for row in rows])
         phi = 0.0
         if np.isfinite(products).any() and square:
@@ -447,25 +455,27 @@ def hidden(story: Story) -> Array:
 
 
 def sides(story: Story) -> list[Side]:
-    """Fitted and held-out runs, as far as there are any."""
+    """List the fitted runs and the held-out runs, as far as they exist."""
     both = (story.fitting, story.held_out)
     return [side for side in both if side is not None and len(side.names)]
 
 
 def rms(story: Story, side: Side, which: str) -> float:
-    """RMS of a side's residual over all channels in units of the noise; ``which`` is before or
-    after.
+    """Compute the RMS residual of a data split over all channels, in units of the noise.
+
+    Args:
+        story: Report data.
+        side: Data split.
+        which: ``before`` or ``after``.
     """
     sigma = np.array([c.sigma for c in story.channels])
     left = (side.observed - getattr(side, which)) / sigma
-    # The mean of nothing would warn.
+    # The mean of an empty set would cause a warning.
     return float(np.sqrt(np.nanmean(left**2))) if np.isfinite(left).any() else float("nan")
 
 
 def coefficients(cause: Cause) -> str:
-    """A cause's coefficients with intervals, how unlikely it is by chance, and what would do as
-    well.
-    """
+    """Format a cause's coefficients with intervals, its p-value, and its alternatives."""
     others = ""
     if cause.alternatives:
         names = of_set(cause.alternatives)
@@ -475,9 +485,14 @@ def coefficients(cause: Cause) -> str:
 
 
 def largest(story: Story, kind: str) -> str:
-    """The run, channel or phase with the largest gap, where there is a choice."""
+    """Format the run, channel or phase with the largest gap, if there are several.
+
+    Args:
+        story: Report data.
+        kind: ``run``, ``channel`` or ``phase``.
+    """
     there = [place for place in story.places if place.kind == kind and isfinite(place.before)]
-    # Of one alone it goes without saying that its gap is the largest.
+    # With a single one, its gap is the largest anyway.
     if len(there) < 2:
         return ""
     place: Place = max(there, key=lambda p: p.before)
@@ -486,8 +501,13 @@ def largest(story: Story, kind: str) -> str:
 
 
 def moves(story: Story, p: Tuned) -> str:
-    """How far a parameter moves once the cause is in: what the base model had bent to absorb of the
-    gap.
+    """Format how far a parameter moves once the cause is in the model.
+
+    The base model had changed it to absorb part of the gap.
+
+    Args:
+        story: Report data.
+        p: Parameter before and after.
     """
     name = clean(p.name, 60)
     unit = f" {pretty(p.unit)}" if pretty(p.unit) else ""
@@ -495,7 +515,7 @@ def moves(story: Story, p: Tuned) -> str:
         nominal = f"its nominal {number(p.before[0])}{unit}"
         return f"{name} is not touched by these data and stays at {nominal}."
     if not story.verdict.causes:
-        # Nothing was found: the last fit is of the base model, too, and the best one.
+        # Without a cause, the last fit is also of the base model, and is the best one.
         return f"{name} = {tuned(p, 1)}."
     before, after = tuned(p, 0), tuned(p, 1)
     end = ": it had absorbed part of the gap." if absorbed(p) else "."
@@ -503,7 +523,12 @@ def moves(story: Story, p: Tuned) -> str:
 
 
 def tuned(p: Tuned, when: int) -> str:
-    """A parameter's estimate before (0) or after (1), with its interval or the bound it lies at."""
+    """Format a parameter's estimate with its interval, or the bound that it is at.
+
+    Args:
+        p: Parameter before and after.
+        when: 0 for the estimate before, 1 for the one after.
+    """
     value, bound = (p.before, p.after)[when], p.bounds[when]
     total = p.in_file if when else ""
     if bound is not None:
@@ -512,25 +537,26 @@ def tuned(p: Tuned, when: int) -> str:
 
 
 def shift(p: Tuned) -> str:
-    """The move of a parameter as a signed percentage, or a number where it began at zero."""
+    """Format the change of a parameter in percent, or as a number if it was zero before."""
     move = p.after[0] - p.before[0]
     if not move:
         return "unchanged"
     if abs(move) < LEAST_MOVE * abs(p.before[0]):
         return f"changes by less than {percent(LEAST_MOVE)}"
     sign = "+" if move > 0 else ""
-    # Of zero there is no share, and "+4000 %" says less than the number.
+    # For zero a percentage is undefined, and a very large one is less clear than the number.
     if not p.before[0] or abs(move / p.before[0]) > FAR:
         return sign + with_unit(number(move, 2), p.unit)
     return sign + percent(move / abs(p.before[0]))
 
 
 def absorbed(p: Tuned) -> bool:
-    """Whether a parameter changes significantly: by more than its two 95 % intervals allow for, and
-    by `LEAST_MOVE` at least.
+    """Return whether a parameter changes significantly.
+
+    The change must exceed the combined 95 % intervals, and be at least `LEAST_MOVE` of the value.
     """
     move = abs(p.after[0] - p.before[0])
-    # Without intervals a change of some size has to do.
+    # Without intervals, a minimum relative change is required instead.
     if not np.isfinite([*p.before, *p.after]).all():
         return move > MOVED * abs(p.before[0])
     before, after = ((high - low) / 2.0 for _, low, high in (p.before, p.after))
@@ -538,13 +564,13 @@ def absorbed(p: Tuned) -> bool:
 
 
 def experiment(story: Story) -> str:
-    """What to do next, in words; empty where nothing is proposed."""
+    """Format the proposed next experiment; empty if there is none."""
     proposed = story.verdict.next_experiment
     return sentence(proposed.says) if proposed is not None else ""
 
 
 def effort(story: Story) -> str:
-    """What was simulated."""
+    """Format the number of simulations, system, engine and duration."""
     verdict = story.verdict
     system = clean(verdict.system, 60)
     engine = clean(verdict.engine, 60)

@@ -1,6 +1,4 @@
-"""What to do next: the experiment that would tell more, the numbers to trust, the lines of the
-model file to change, and the commands.
-"""
+"""Report section on next steps: experiment, reliable numbers, model-file changes and commands."""
 
 from __future__ import annotations
 
@@ -16,17 +14,17 @@ from bench.gap.report.words import clean, noun, sentence
 from bench.pages.elements import code, folded, listed, paragraph, safe, strong
 
 FEW_LINES = 12
-"""Changes of a model file that stand open; more are behind a click."""
+"""Maximum number of changes of a model file that are shown unfolded."""
 _OTHER, _LOGS = "OTHER.csv", "LOGS.csv"
-"""Words that a reader replaces."""
+"""Placeholders that a reader replaces."""
 
 
 def advice(story: Story, folder: Path | None) -> Iterator[str]:
-    """The section's parts, in the order in which one would act.
+    """Yield the parts of the section, in the order in which a user would act.
 
     Args:
-        story: what is told.
-        folder: that the explanation is written to; None for a notebook's.
+        story: Report data.
+        folder: Folder of the written explanation; None in a notebook.
     """
     if story.verdict.recording_faults:
         yield from _corrections(story)
@@ -39,7 +37,7 @@ def advice(story: Story, folder: Path | None) -> Iterator[str]:
 
 
 def _corrections(story: Story) -> Iterator[str]:
-    """The lines of the description that correct a wrong unit or sign, and the command to repeat."""
+    """Yield the lines that correct a wrong unit or sign, and the command to repeat."""
     file = story.path.with_suffix(".toml").name
     for fault in story.verdict.recording_faults:
         yield paragraph(safe(sentence(fault.says), 1000))
@@ -63,7 +61,7 @@ def _experiment(story: Story) -> Iterator[str]:
 
 
 def _numbers(story: Story) -> Iterator[str]:
-    """The numbers of what was found, each with its interval, and whether all runs agree on them."""
+    """Yield the numbers of the causes with intervals, and their consistency between runs."""
     if not story.verdict.causes:
         return
     found = [
@@ -76,15 +74,15 @@ def _numbers(story: Story) -> Iterator[str]:
 
 
 def changes(story: Story) -> Iterator[str]:
-    """The lines of the robot's model file to change, before and after."""
-    # What is to be known of a file in which nothing changes is of no use.
+    """Yield the lines of the robot's model file to change, before and after."""
+    # Notes on an unchanged file are not useful.
     if not story.changes and not (story.unwritten and story.verdict.causes):
         return
     head = strong("What to change in the model file") + " (extended.xml has it done):"
     lines = []
     for change in story.changes:
         lines.append(f'<span class="soft">{safe(change.element, 120)}</span>')
-        # One blank line between elements, and none within.
+        # A blank line separates elements, and there is none within an element.
         lines += [f'<del class="line">− {safe(change.before, 2000)}</del>'] * bool(change.before)
         lines += [f'<ins class="line">+ {safe(change.after, 2000)}</ins>'] * bool(change.after)
         lines += [f'<span class="soft">  {safe(change.comment, 600)}</span>'] * bool(change.comment)
@@ -102,7 +100,7 @@ def changes(story: Story) -> Iterator[str]:
 
 
 def _models(story: Story, folder: Path | None) -> Iterator[str]:
-    """How the extended simulator is held against another recording, and used."""
+    """Yield the command that scores the extended simulator on another recording."""
     if folder is None:
         return
     model = folder / "extended.toml"
@@ -113,7 +111,7 @@ def _models(story: Story, folder: Path | None) -> Iterator[str]:
 
 
 def _further(story: Story) -> Iterator[str]:
-    """What the verdict leaves to do."""
+    """Yield the next steps that depend on the verdict."""
     verdict = story.verdict.verdict
     if verdict == "adequate":
         yield paragraph(
@@ -142,12 +140,12 @@ def _further(story: Story) -> Iterator[str]:
 
 
 def _recording(story: Story) -> str:
-    """The recording's path; of several logs a word in their place."""
+    """Return the recording's path; for several logs a placeholder."""
     return str(story.path) if story.logs == 1 else _LOGS
 
 
 def command(*words: object) -> str:
-    """A command to copy: its words quoted for a shell."""
-    # A line break or an escape sequence in a path must not reach a terminal as such.
+    """Render a command that can be copied, with its words quoted for a shell."""
+    # Line breaks and escape sequences in a path must not reach a terminal unchanged.
     texts = [shlex.quote(clean(word, 500)) for word in words]
     return f'<pre class="copied" tabindex="0">{escape(" ".join(texts))}</pre>'

@@ -1,6 +1,4 @@
-"""Which number to trust: what each run, log or load says by itself, in words, in a table and as
-rows of a file.
-"""
+"""Consistency of each parameter between runs, logs or loads: sentences, a table and file rows."""
 
 from __future__ import annotations
 
@@ -16,16 +14,23 @@ from bench.gap.report.words import clean, estimate, joined, number, probability,
 from bench.pages.elements import paragraph, safe, table
 
 MOST = 12
-"""Rows of the table, those that agree least first."""
+"""Maximum number of rows of the table, the least consistent first."""
 NAMED = 4
-"""Numbers that one sentence names."""
+"""Maximum number of parameters that a sentence names."""
 _DRAWN = 180.0
 HEAD = ("model", "number", "unit", "by", "group", "value", "low", "high")
-"""Columns of the file."""
+"""Columns of the file apart.csv."""
 
 
 def told(story: Story) -> list[str]:
-    """Sentences: what does not agree, what made it agree, and what drifts."""
+    """Format sentences about the consistency of the parameters.
+
+    They report which parameters differ between groups, which are consistent with the causes only,
+    and which drift.
+
+    Args:
+        story: Report data.
+    """
     before = {(s.number, s.by): s for s in story.apart.before}
     after = story.apart.after
     causes = joined([clean(cause.effect, 60) for cause in story.verdict.causes])
@@ -55,7 +60,7 @@ def told(story: Story) -> list[str]:
 
 
 def _clearest(apart: Sequence[Spread]) -> list[Spread]:
-    """Each number once, where it moves with something if it does, else where it is surest."""
+    """Return each parameter once, preferably with the grouping in which it has a trend."""
     by_number: dict[str, list[Spread]] = {}
     for one in apart:
         by_number.setdefault(one.number, []).append(one)
@@ -63,7 +68,7 @@ def _clearest(apart: Sequence[Spread]) -> list[Spread]:
 
 
 def _rank(one: Spread) -> tuple[bool, int, float]:
-    """What says most first: what it moves with, a constant before others; any constant, logs."""
+    """Return a sort key: by trend first, then constants, logs and runs, then by p-value."""
     by = {"log": 1, "run": 2}.get(one.by, 0)
     return not (_moves(one) or one.mover is not None), by, one.chance
 
@@ -93,7 +98,7 @@ def _apart(one: Spread, known: Sequence[str]) -> str:
 
 
 def _along(mover: Mover) -> str:
-    """What a number moves with, and what that cannot be told from."""
+    """Format the covariate of a trend and those that are indistinguishable from it."""
     return " or ".join(clean(name, 40) for name in (mover.name, *mover.also[:2]))
 
 
@@ -103,7 +108,7 @@ def _span(one: Spread) -> str:
 
 
 def _drifts(after: Sequence[Spread]) -> Iterator[str]:
-    """Of logs in the order of time: what drifts."""
+    """Yield sentences on the parameters that drift over the logs."""
     logs = [s for s in after if s.by == "log" and s.trend is not None]
     if not logs:
         return
@@ -130,7 +135,7 @@ def _plural(by: str) -> str:
 
 
 def agreement(story: Story) -> Iterator[str]:
-    """The section of the page; nothing where there is one run alone."""
+    """Yield the section of the page; nothing for a single run."""
     after = sorted(story.apart.after, key=lambda one: one.chance)
     if not after:
         return
@@ -159,7 +164,7 @@ def _within(one: Spread, error: float) -> str:
 
 
 def _drawn(one: Spread) -> str:
-    """Each group's interval, one below another, with the joint one as a band behind them."""
+    """Draw the interval of each group one below the other, over a band for the joint fit."""
     ends = [(p.value - Z95 * p.error, p.value + Z95 * p.error) for p in one.parts]
     low, high = min(e[0] for e in ends), max(e[1] for e in ends)
     if not (np.isfinite([low, high]).all() and high > low):
@@ -184,7 +189,7 @@ def _drawn(one: Spread) -> str:
 
 
 def rows(story: Story) -> list[tuple[object, ...]]:
-    """Rows of `HEAD`: the joint fit and each group of each number, with 95 % intervals."""
+    """Build the rows of `HEAD`: joint fit and groups of each parameter, with 95 % intervals."""
     found: list[tuple[object, ...]] = []
     models = [("base", story.apart.before)]
     if story.verdict.causes:

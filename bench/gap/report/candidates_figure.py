@@ -1,6 +1,4 @@
-"""The figure of the candidate causes: how much of the gap each closes by itself, and the evidence
-for it.
-"""
+"""Figure of the candidate causes: the share of the gap that each closes, and its score."""
 
 from __future__ import annotations
 
@@ -23,19 +21,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FOUND, ALIKE, NOT_NEEDED = "found", "found, but cannot be told apart", "not needed"
-"""What `standing` says of a candidate."""
+"""Status texts of candidates, as returned by `standing`."""
 LINE_LENGTH = 44
-"""A candidate's name of more characters has several lines."""
+"""Maximum number of characters per line of a candidate's name."""
 LONGEST_LINE = 50
-"""Longest line of the name of a place, in characters."""
+"""Maximum number of characters per line of the name of a place."""
 CERTAIN = 1e-3
-"""A p-value up to this is not printed beside its bar: a note gives the largest one."""
+"""Maximum p-value that is not printed next to its bar; a note gives the largest of them."""
 CHANCE = 0.05
-"""A larger p-value is not printed either: its bar is white, and a note says why."""
+"""Maximum p-value of a significant score. A candidate above it has a white bar without its p-value,
+and a note explains that.
+"""
 LOWEST_SHARE = -0.5
-"""Shares below this are drawn there: how much worse a failed model is has no meaning."""
+"""Lower limit of a share in the figure; for a failed model the exact value has no meaning."""
 POINTER = "▸ "
-"""Stands before the name of a cause, which is bold too, so that it stands out in grey."""
+"""Marker before the name of a cause, visible in print without colour too."""
 
 _BARS: Mapping[str, Mapping[str, Any]] = {
     FOUND: {"facecolor": BLUE},
@@ -66,18 +66,19 @@ _NAME_SIZE = 9
 def candidates_figure(story: Story) -> Figure:
     """Draw the candidates, the highest score first.
 
-    Left the share of the held-out gap that each closes by itself, with its 95 % interval, where any
-    was simulated there. Right the evidence for it on the fitted runs.
+    The left panel shows the share of the held-out gap that each closes alone, with its 95 %
+    interval, if any candidate was simulated on held-out runs. The right panel shows the score on
+    the fitted runs.
     """
     shown = ranked(story)
     names = [_name(story, candidate) for candidate in shown]
     has_shares = any(candidate.heldout_gain is not None for candidate in shown)
 
-    # Bold, as names of causes are, and a little wider than the others.
+    # Names of causes are bold, which is a little wider.
     left = _EDGE + 0.12 + text_width(names, _NAME_SIZE, "bold")
     between = _SHARES_WIDTH + _SHARE_TEXTS_WIDTH if has_shares else 0.0
     width = max(left + between + _SCORES_WIDTH + _SCORE_TEXTS_WIDTH + _EDGE, 7.0)
-    # Rows are as high as the longest name needs, so that bars stand at even distances.
+    # All rows have the height of the longest name, so that bars are evenly spaced.
     row = _ROW + _LINE * most_lines(names)
     handles, labels = _legend(story)
     top = _TOP if handles else _TOP_WITHOUT_LEGEND
@@ -116,13 +117,13 @@ def candidates_figure(story: Story) -> Figure:
 
 
 def _name(story: Story, candidate: Candidate) -> str:
-    """A candidate's name in as many lines as it needs; its place is never cut."""
+    """Format a candidate's name in as many lines as needed; its place is never cut off."""
     text = clean(short_name(candidate.effect), 160)
     if standing(story, candidate.effect) != NOT_NEEDED:
         text = POINTER + text
     if len(text) <= LINE_LENGTH:
         return text
-    # The place has lines of its own.
+    # The place has its own lines.
     effect, at, place = text.rpartition(" at ")
     lines = textwrap.wrap(effect if at else text, LINE_LENGTH)
     return "\n".join([*lines, break_name(f"at {place}", LONGEST_LINE)] if at else lines)
@@ -206,17 +207,17 @@ def _scores_panel(axis: Axes, story: Story, shown: Sequence[Candidate], thicknes
 
 
 def _is_chance(story: Story, candidate: Candidate) -> bool:
-    """Whether chance gives such a score, and no cause has this effect."""
+    """Return whether the score of a candidate that is not a cause is insignificant."""
     return candidate.p_value > CHANCE and standing(story, candidate.effect) == NOT_NEEDED
 
 
 def _printed(p_value: float) -> str:
-    """``p < 10⁻¹²``."""
+    """Format a p-value, such as ``p < 10⁻¹²``."""
     return probability(p_value).replace(" 1×10", " 10")
 
 
 def _notes(story: Story, shown: Sequence[Candidate]) -> list[str]:
-    """What the figure counts, and the p-values that are not printed beside their bars."""
+    """Format the number of runs and samples, and p-values that are not printed next to bars."""
     counts = f"Fitted: {_counted(story.fitting)}"
     if story.held_out is not None and story.cross_validated:
         counts += "; each run left out in turn"
@@ -240,7 +241,7 @@ def _notes(story: Story, shown: Sequence[Candidate]) -> list[str]:
 
 
 def _counted(side: Side) -> str:
-    """``3 runs, 1200 samples of 2 channels``; a sample is one instant of a run."""
+    """Format the size of a data split, such as ``3 runs, 1200 samples of 2 channels``."""
     runs, channels = len(side.times), side.observed.shape[2]
     samples = int(np.isfinite(side.observed).any(axis=2).sum())
     one = "1 run" if runs == 1 else f"{runs} runs"
@@ -249,12 +250,12 @@ def _counted(side: Side) -> str:
 
 
 def _legend(story: Story) -> tuple[list[Any], list[str]]:
-    """Handles and labels of the legend."""
+    """Return handles and labels of the legend."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     there = {standing(story, candidate.effect) for candidate in story.verdict.candidates}
-    # Bars of one look need no legend where nothing is found.
+    # If all bars have the same style, no legend is needed.
     names = [name for name in _BARS if name in there] if there != {NOT_NEEDED} else []
     handles: list[Any] = [Patch(edgecolor=INK, linewidth=0.6, **_BARS[name]) for name in names]
     if any(entry.elsewhere for entry in entries(story)) and has_places(story):

@@ -1,4 +1,4 @@
-"""The lines of a robot's model file that its extended one has otherwise."""
+"""Changed lines between a robot's model file and the extended model file."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from difflib import SequenceMatcher
 from bench.gap.report.story import Change
 
 ALIKE = 0.5
-"""Share of elements that stay: where fewer do, the file was written anew, with no lines before."""
+"""Minimum share of unchanged elements; with fewer, the file counts as rewritten and old lines are
+not shown.
+"""
 FITTED = ", fitted to "
-"""What a comment says that names a cause."""
+"""Text that marks comments about a cause."""
 _COMMENT = re.compile(r"<!--\s*(.*?)\s*-->")
 _PART = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 _HEAD = re.compile(r"<(\w+)")
@@ -19,12 +21,13 @@ _NAME = re.compile(r"\bname\s*=\s*[\"']([^\"']*)")
 
 
 def changes(before: str, after: str) -> tuple[Change, ...]:
-    """The changed lines of a model file, in its order; those with a comment alone where the file
-    was written anew.
+    """Find the changed lines of a model file, in its order.
+
+    For a rewritten file, these are the elements with a comment.
 
     Args:
-        before: text of the file; empty where there is none of the same form.
-        after: text of the extended one, in which a comment stands above what it changes.
+        before: Text of the file; empty if there is none of the same format.
+        after: Text of the extended file, where comments precede the elements that they describe.
     """
     old, new = _elements(before), _elements(after)
     matcher = SequenceMatcher(None, old, new, autojunk=False)
@@ -38,14 +41,14 @@ def changes(before: str, after: str) -> tuple[Change, ...]:
 
 
 def _elements(text: str) -> list[str]:
-    """Tags and comments, one each, however they lie on lines."""
+    """Split the text into tags and comments, whatever the line breaks."""
     return [" ".join(part.split()) for part in _PART.findall(text)]
 
 
 def _block(old: Sequence[str], new: Sequence[str]) -> Iterator[Change]:
-    """Lines that stand instead of others, each with the comments above it."""
+    """Yield the changes of a block of elements, each with the comments before it."""
     elements = list(_with_comments(new))
-    # As many as before: each stands instead of the one at its place.
+    # With equal counts, each new element replaces the old one at its position.
     if len(old) != len(elements):
         for i, (line, comment) in enumerate(elements):
             yield Change(_element(line), "\n".join(old) if i == 0 else "", line, comment)
@@ -57,18 +60,18 @@ def _block(old: Sequence[str], new: Sequence[str]) -> Iterator[Change]:
 
 
 def _commented(lines: Sequence[str]) -> Iterator[Change]:
-    """The elements with a comment, of a file that was written anew."""
+    """Yield the elements with a comment, of a rewritten file."""
     for line, comment in _with_comments(lines):
         if comment:
             yield Change(_element(line), "", line, comment)
 
 
 def _with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Each line that is no comment, with the comments above it."""
+    """Yield each element with the comments before it."""
     above: list[str] = []
     for line in lines:
         if match := _COMMENT.fullmatch(line):
-            # A comment on the whole file says nothing of the element below it.
+            # A comment on the whole file does not describe the next element.
             above += [match[1]] if FITTED in match[1] else []
             continue
         yield line, "; ".join(above)
@@ -76,6 +79,6 @@ def _with_comments(lines: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 
 def _element(line: str) -> str:
-    """``joint elbow`` of a line of XML."""
+    """Format the element of a line of XML, such as ``joint elbow``."""
     head, name = _HEAD.search(line), _NAME.search(line)
     return " ".join(match[1] for match in (head, name) if match)

@@ -1,5 +1,6 @@
-"""The candidates and the places of the gap as tables to work with, and what the residual follows as
-a chart; their numbers are those of verdict.json and of the story.
+"""Tables of candidates and gap locations, and a chart of residual profiles.
+
+Their numbers are those of verdict.json and of the report data.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from sims.base import InputError
 CANDIDATES, PLACES, FOLLOWS = "candidates", "where", "follows"
 """Names of the tables."""
 BEST, ELSEWHERE = "the best of each effect", "the same at other places"
-"""Rows of a robot's candidates."""
+"""Labels of the rows of a robot's candidates, for the filter."""
 
 
 def candidates_table(story: Story) -> Table:
-    """A row for each candidate, the highest score first."""
+    """Build a table with one row per candidate, the highest score first."""
     sets = _sets(story)
     heads = {entry.best.effect for entry in entries(story)}
     found = bool(story.verdict.causes)
@@ -34,13 +35,13 @@ def candidates_table(story: Story) -> Table:
         _, place = parted(c.effect)
         rows.append(
             {
-                # A place has a column of its own.
+                # A place has its own column.
                 "candidate": clean(name_of(parted(c.effect)[0]), 120),
                 "effect": clean(c.effect, 120),
                 "score": c.score,
                 "p_value": c.p_value,
                 "heldout_gain": c.heldout_gain,
-                # Where nothing is found, nothing made the others needless.
+                # Without a diagnosed cause, "not needed" would be wrong.
                 "standing": standing(story, c.effect) if found else "not convincing",
                 "set": sets.get(c.effect, ""),
                 "kind": kind_of(c.effect),
@@ -54,13 +55,13 @@ def candidates_table(story: Story) -> Table:
 
 
 def _needless(story: Story) -> list[str]:
-    """Columns that would be empty."""
+    """List the columns that would be empty."""
     columns = [] if _sets(story) else ["set"]
     return columns + ([] if has_places(story) else ["kind", "place", "joint", "shown"])
 
 
 def _sets(story: Story) -> dict[str, str]:
-    """By effect the set that it cannot be told apart from."""
+    """Return, by effect, the set of effects that it is indistinguishable from."""
     found: dict[str, str] = {}
     for cause in story.verdict.causes:
         if cause.alternatives:
@@ -70,19 +71,19 @@ def _sets(story: Story) -> dict[str, str]:
 
 
 def _says(story: Story, name: str) -> str:
-    """What an effect does; that of a cause is said by the verdict."""
+    """Return the description of an effect; for a cause, the one in the verdict."""
     for cause in story.verdict.causes:
         if cause.effect == name:
             return sentence(without_place(clean(cause.says, 400)))
     try:
         return sentence(effects.get(parted(name)[0]).says)
     except InputError:
-        # of a plugin that is not loaded, or of how a robot is stepped
+        # The effect belongs to a plugin that is not loaded, or is a time step or integrator.
         return ""
 
 
 def candidates_grid(frame: Table) -> Grid:
-    """The candidates to sort and to filter; of a robot's effects at first the best place each."""
+    """Make the grid of candidates; for a robot it first shows the best place of each effect."""
     digits = {"score": 3, "p_value": 2, "heldout_gain": 3}
     heads = {
         "effect": "name",
@@ -117,7 +118,7 @@ def candidates_grid(frame: Table) -> Grid:
 
 
 def places_table(story: Story) -> Table:
-    """A row for each part of the data: RMS of the residual in noises."""
+    """Build a table with one row per part of the data: its RMS residual in units of the noise."""
     rows = []
     for p in story.places:
         row = {"kind": p.kind, "part": clean(p.label, 80), "samples": p.samples, "before": p.before}
@@ -131,7 +132,7 @@ def places_table(story: Story) -> Table:
 
 
 def places_grid(frame: Table) -> Grid:
-    """The parts of the data to sort and to filter, the largest gap first."""
+    """Make the grid of the parts of the data, the largest gap first."""
     after = "after" in frame
     heads = {"before": "RMS before" if after else "RMS", "after": "RMS after"}
     digits = {"samples": 7, "before": 3, "after": 3}
@@ -152,7 +153,7 @@ def places_grid(frame: Table) -> Grid:
 
 
 def follows_table(story: Story) -> Table:
-    """The residual against what it may follow, bin by bin."""
+    """Build the table of residual profiles, with one row per bin."""
     rows = []
     for p in story.profiles:
         about = {"channel": clean(p.channel, 80), "variable": clean(p.variable, 80)}
@@ -165,13 +166,13 @@ def follows_table(story: Story) -> Table:
 
 
 def follows_chart(story: Story) -> Chart:
-    """Panels for the variables that tell most at first, every other one to be chosen."""
+    """Make the chart of residual profiles; the most informative ones are shown first."""
     units = {c.name: c.unit for c in story.channels}
     looks = {"before": BEFORE, "after": AFTER}
     first = {id(p) for p in telling(story.profiles)}
     panels = []
     names: list[str] = []
-    # Those that tell most come first.
+    # The most informative profiles come first.
     for p in sorted(story.profiles, key=lambda one: id(one) not in first):
         about = {"channel": clean(p.channel, 80), "variable": clean(p.variable, 80)}
         series = []
@@ -179,7 +180,7 @@ def follows_chart(story: Story) -> Chart:
             where = {**about, "when": when}
             look = looks[when]._replace(marker={"before": "s", "after": "o"}[when])
             series.append(Series(f"simulated {when}", "mean", look, where, "low", "high"))
-        # The title has the names in full. Axes have no room for long ones.
+        # The title contains the full names; axes have no space for long ones.
         name = f"{clean(p.channel, 80)} against {clean(p.variable, 80)}"
         variable = brief(clean(p.variable), MOST_LETTERS)
         channel = clean(p.channel)

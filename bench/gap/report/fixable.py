@@ -1,8 +1,10 @@
-"""The report's section on what the recording can determine, before any verdict: a sentence, the
-free numbers, and a matrix of the causes; every number behind a click.
+"""Report section on what the recording can identify, independent of the verdict.
 
-What the verdict has found is determined, whatever the score about the base model says of it, and
-members of its sets are marked as such: the section must not contradict the headline.
+It has a summary sentence, the free parameters, and a matrix of the causes; the full table is
+folded.
+
+A diagnosed cause counts as identifiable, whatever its score about the base model, and members of
+indistinguishable sets are marked. The section must not contradict the headline.
 """
 
 from __future__ import annotations
@@ -19,10 +21,10 @@ from bench.gap.verdict import Cause
 from bench.pages.elements import code, folded, paragraph, safe, strong, table
 
 MOST = 6
-"""Names in a cell, or in a list, before the others are counted."""
+"""Maximum number of names in a cell or list; the remaining ones are counted."""
 _HEADS = ("number", "can it be fixed", "95 % interval", "of its range", "mixed up with")
 _STANDINGS = ("found", "set", "identifiable", "weak", "not identifiable")
-"""What can be said of a cause, the surest first."""
+"""Status of a cause, the most certain first."""
 _SIGNS: Mapping[str, str] = {
     "found": "★",
     "set": "☆",
@@ -30,7 +32,7 @@ _SIGNS: Mapping[str, str] = {
     "weak": "◐",
     "not identifiable": "○",
 }
-"""Each in a cell of the matrix."""
+"""Sign of each status in a cell of the matrix."""
 _LEGEND: Mapping[str, str] = {
     "found": "found by the verdict",
     "set": "explains the data as well as what was found",
@@ -43,12 +45,12 @@ _KINDS = {"joint": "joints", "actuator": "actuators", "body": "bodies", "channel
 
 @dataclass(frozen=True)
 class _Row:
-    """A cause with what can be said of it.
+    """Cause with its identifiability.
 
     Attributes:
-        number: what the recording can say of it.
-        effect: its registered name.
-        standing: of `_STANDINGS`.
+        number: Identifiability of the coefficient.
+        effect: Registered name of the effect.
+        standing: One of `_STANDINGS`.
     """
 
     number: Number
@@ -57,7 +59,7 @@ class _Row:
 
 
 def fixable(story: Story) -> Iterator[str]:
-    """What can be said of each free number and of each cause; nothing where that is not known."""
+    """Yield the section on free parameters and causes; nothing if identifiability is unknown."""
     numbers = story.fixable
     if not numbers:
         return
@@ -83,8 +85,10 @@ def fixable(story: Story) -> Iterator[str]:
 
 
 def _told_apart(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]]:
-    """The rows of effects with something to tell, and those of effects that could be determined at
-    every place.
+    """Separate effects that are identifiable at every place from all others.
+
+    Returns:
+        Rows of the other effects, and rows of effects that are identifiable at every place.
     """
     telling = {parted(r.effect)[0] for r in rows if r.standing != "identifiable"}
     first = [row for row in rows if parted(row.effect)[0] in telling]
@@ -92,13 +96,13 @@ def _told_apart(rows: Sequence[_Row]) -> tuple[list[_Row], list[_Row]]:
 
 
 def _matrices(rows: Sequence[_Row]) -> Iterator[str]:
-    """A matrix for each kind of places."""
+    """Yield a matrix for each kind of place."""
     for kind in dict.fromkeys(kind_of(row.effect) for row in rows):
         yield _matrix([row for row in rows if kind_of(row.effect) == kind], kind)
 
 
 def counted(story: Story) -> str:
-    """How many causes can be determined, and what was found among them."""
+    """Format how many causes are identifiable, and which were found."""
     rows = _rows(story)
     words = [str("identifiable" if r.standing == "found" else r.number.word) for r in rows]
     counts = {s: words.count(s) for s in _STANDINGS[2:]}
@@ -112,19 +116,19 @@ def counted(story: Story) -> str:
 
 
 def _causes(story: Story) -> list[Cause]:
-    """Causes that the verdict vouches for."""
+    """Return the causes that the verdict supports."""
     vouched = story.verdict.verdict in ("named", "ambiguous", "partial")
     return list(story.verdict.causes) if vouched else []
 
 
 def _rows(story: Story) -> list[_Row]:
-    """The causes in the order of the numbers, with the verdict's own marked."""
+    """List the causes in the order of the numbers, with those of the verdict marked."""
     found: dict[str, str] = {}
     for cause in _causes(story):
         for name in (cause.effect, *cause.alternatives):
             standing = "set" if cause.alternatives else "found"
             found.setdefault(name, standing)
-            # Of a family, the members with a number of their own.
+            # For a family, members with a coefficient of their own are marked.
             for key in cause.coefficients if name == cause.effect else ():
                 if place := parted(key)[1]:
                     found.setdefault(f"{parted(name)[0]}@{place}", standing)
@@ -146,7 +150,7 @@ def _best(rows: Sequence[_Row]) -> _Row:
 
 
 def _matrix(rows: Sequence[_Row], kind: str) -> str:
-    """Effects by places of one kind."""
+    """Render the matrix of effects by places of one kind."""
     places = list(dict.fromkeys(_place(row) for row in rows))
     by_effect: dict[str, dict[str, list[_Row]]] = {}
     for row in rows:
@@ -165,7 +169,7 @@ def _matrix(rows: Sequence[_Row], kind: str) -> str:
 
 
 def _sign(rows: Sequence[_Row]) -> str:
-    """A cell of the matrix: its sign, and in words what it says."""
+    """Render a cell of the matrix: its sign, and its meaning as text."""
     best = _best(rows)
     said = f"{best.effect}: {_LEGEND[best.standing]}{_interval(best.number, ', ')}"
     label = safe(said, 200)
@@ -174,7 +178,7 @@ def _sign(rows: Sequence[_Row]) -> str:
 
 
 def _families(rows: Sequence[_Row]) -> str:
-    """Causes without a place: families of effects by how well they can be determined."""
+    """Render the table of causes without a place: families of effects by identifiability."""
     columns = [s for s in _STANDINGS if any(row.standing == s for row in rows)]
     families: dict[str, dict[str, list[str]]] = {}
     for row in rows:
@@ -203,7 +207,7 @@ def _interval(one: Number, before: str = "") -> str:
 
 
 def _cells(one: Number, word: str) -> list[str]:
-    """A row of a table of numbers."""
+    """Format a row of a table of parameters."""
     span = f"{number(one.low)} to {number(one.high)}"
     mixed = joined([f"{name} ({corr:.2f})" for name, corr in one.mixed]) if one.mixed else "–"
     return [code(safe(one.name, 60)), safe(word), safe(_interval(one)) or "–", safe(span),

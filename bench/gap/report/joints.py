@@ -1,5 +1,7 @@
-"""The motion of a robot joint by joint: a row each with what was measured and simulated, and beside
-it what the simulations leave of each recorded quantity, in units of its noise.
+"""Figure of a robot's motion joint by joint.
+
+Each row shows the measured and simulated motion, and next to it the residual of each recorded
+quantity in units of its noise.
 """
 
 from __future__ import annotations
@@ -24,33 +26,41 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_JOINTS = 10
-"""Rows that are shown, the worst."""
+"""Maximum number of rows; those with the largest residuals are shown."""
 QUANTITIES: Mapping[str, str] = {"q": "position", "qd": "velocity", "tau": "torque"}
-"""Of a joint, by the first part of a channel's name; a sensor's has a row of its own."""
+"""Quantities of a joint, by the first part of a channel's name; a sensor has its own row."""
 LEAST = 4.0
-"""Residuals are shown to at least so many sigmas: noise fills no panel."""
+"""Minimum half-height of a residual panel in noise standard deviations, so that noise does not fill
+the panel.
+"""
 TALLEST = 0.999
-"""Share of the residuals that a panel shows: a single wild sample must not flatten the rest."""
+"""Quantile of the residuals that fits into a panel, so that a single outlier does not flatten the
+others.
+"""
 _HEIGHTS = {1: 2.6, 2: 1.9, 3: 1.5, 4: 1.25, 5: 1.1}
-"""Inches of a row, by their number."""
+"""Height of a row in inches, by the number of rows."""
 _LEAST_HEIGHT = 1.0
 POINTER = "▸"
-"""Before the name of a joint that the verdict names: in grey, too, it stands out."""
+"""Marker before the name of a diagnosed joint, visible in print without colour too."""
 LONGEST_NAME = 64
-"""Characters of the name of a joint or sensor that are shown."""
+"""Maximum number of characters of the name of a joint or sensor."""
 _NAME_LINE = 18
-"""Longest line of such a name, in characters."""
+"""Maximum number of characters per line of the name of a joint or sensor."""
 _NAME_SIZE = 9.5
-"""Size of its letters, in points."""
+"""Font size of the names of joints and sensors, in points."""
 _BESIDE_NAME = 0.85
-"""Inches from the end of the names to the panels: ticks and units stand there."""
+"""Space between names and panels in inches, for ticks and units."""
 _HEAD, _FOOT = 0.75, 0.95
-"""Inches above and below the rows."""
+"""Space above and below the rows, in inches."""
 
 
 class Row(NamedTuple):
-    """A joint or a sensor: its name, the channel whose motion is shown, and its channels by
-    quantity.
+    """Row of the figure: a joint or a sensor.
+
+    Attributes:
+        name: Name of the joint or sensor.
+        shown: Index of the channel whose motion is shown.
+        channels: Indices of its channels, by quantity.
     """
 
     name: str
@@ -59,12 +69,12 @@ class Row(NamedTuple):
 
 
 def by_joint(story: Story) -> bool:
-    """Whether the channels are those of a robot."""
+    """Return whether the channels are those of a robot."""
     return story.robot is not None and len(rows_of(story)) > 0
 
 
 def rows_of(story: Story) -> list[Row]:
-    """A row for each joint, in the order of the channels, then one for each sensor."""
+    """List a row for each joint, in the order of the channels, then one for each sensor."""
     joints: dict[str, dict[str, int]] = {}
     sensors = []
     for c, channel in enumerate(story.channels):
@@ -75,14 +85,14 @@ def rows_of(story: Story) -> list[Row]:
             sensors.append(Row(channel.name, c, {_first(story): c}))
     rows = []
     for name, channels in joints.items():
-        # The motion itself where it was recorded, else what comes nearest to it.
+        # The position is shown if it was recorded, otherwise the velocity or the torque.
         shown = next(channels[q] for q in QUANTITIES if q in channels)
         rows.append(Row(name, shown, channels))
     return rows + sensors
 
 
 def _first(story: Story) -> str:
-    """The quantity of the first column of residuals, where sensors have theirs too."""
+    """Return the quantity of the first residual column, which also holds those of sensors."""
     return next(iter(_quantities(story)), "q")
 
 
@@ -92,7 +102,12 @@ def _quantities(story: Story) -> list[str]:
 
 
 def joints_figure(story: Story, shot: Shot) -> Figure:
-    """The run joint by joint."""
+    """Draw a run joint by joint.
+
+    Args:
+        story: Report data.
+        shot: Run to draw.
+    """
     rows = _worst(story, shot)
     quantities = _quantities(story) or ["q"]
     height = _HEIGHTS.get(len(rows), _LEAST_HEIGHT)
@@ -119,14 +134,14 @@ def joints_figure(story: Story, shot: Shot) -> Figure:
     axes[0, 0].set_title("measured and simulated", fontsize=9.5, loc="left")
     for panel in axes[-1]:
         panel.set_xlabel("time [s]")
-        # The narrower column has no room for more; a late run has long numbers.
+        # The narrow columns have little space for tick labels, which may be long.
         panel.locator_params(axis="x", nbins=4)
     _finish(figure, axes, story, shot, rows, left)
     return figure
 
 
 def _worst(story: Story, shot: Shot) -> list[Row]:
-    """The rows to show, in their order: of very many the worst."""
+    """Select the rows with the largest residuals, in their original order."""
     rows = rows_of(story)
 
     def gap(row: Row) -> float:
@@ -137,14 +152,14 @@ def _worst(story: Story, shot: Shot) -> list[Row]:
 
 
 def _size(story: Story, shot: Shot, c: int, which: str) -> float:
-    """RMS of a channel's residual in this run, in units of its noise; 0 where nothing was seen."""
+    """Return the RMS residual of a channel in this run in noise units; 0 without samples."""
     left = _left(story, shot, c, which)
     there = left[np.isfinite(left)]
     return float(np.sqrt(np.mean(there**2))) if there.size else 0.0
 
 
 def _left(story: Story, shot: Shot, c: int, which: str) -> Array:
-    """(T,) the residual of a channel in units of its noise."""
+    """Return the residual (T,) of a channel in units of its noise."""
     count = len(shot.side.times[shot.row])
     simulated = getattr(shot.side, which)
     left: Array = (shot.side.observed - simulated)[shot.row, :count, c] / story.channels[c].sigma
@@ -152,7 +167,7 @@ def _left(story: Story, shot: Shot, c: int, which: str) -> Array:
 
 
 def _motion(panel: Axes, story: Story, shot: Shot, row: Row, found: bool) -> None:
-    """Measured and simulated; the name of the joint beside it."""
+    """Draw the measured and simulated motion, with the name of the joint next to it."""
     channel, side = story.channels[row.shown], shot.side
     times = side.times[shot.row]
     signals = [
@@ -176,7 +191,7 @@ def _motion(panel: Axes, story: Story, shot: Shot, row: Row, found: bool) -> Non
     tuned = "simulated before (tuned)" if changed(story) else "simulated (tuned)"
     panel.plot(t, before, label=tuned, zorder=3, **BEFORE)
     if changed(story):
-        # Where all agree, before is seen dashed upon after, and that upon what was measured.
+        # Where the curves agree, "before" is visible as dashes on "after", and "after" on the dots.
         panel.plot(t, after, label="simulated after", zorder=2, **AFTER)
     quantity = channel.name.partition(".")[0]
     symbol = quantity if quantity in QUANTITIES else ""
@@ -200,13 +215,13 @@ def _motion(panel: Axes, story: Story, shot: Shot, row: Row, found: bool) -> Non
 
 
 def _row_name(row: Row, found: bool) -> str:
-    """The name of a joint or sensor in short lines."""
+    """Format the name of a joint or sensor in short lines."""
     name = break_name(clean(row.name, LONGEST_NAME), _NAME_LINE)
     return f"{POINTER} {name}" if found else name
 
 
 def _residual(panel: Axes, story: Story, shot: Shot, c: int) -> None:
-    """What the simulations leave of a channel, with the size of each."""
+    """Draw the residuals of a channel, with their RMS."""
     times = shot.side.times[shot.row]
     panel.axhspan(-2, 2, color=BAND, linewidth=0, label="±2σ: 95 % of the noise", zorder=0)
     panel.axhline(0, color=ZERO, linewidth=0.6, zorder=1)
@@ -239,7 +254,7 @@ def _residual(panel: Axes, story: Story, shot: Shot, c: int) -> None:
 def _one_scale(
     panels: Sequence[Axes], story: Story, shot: Shot, rows: Sequence[Row], quantity: str
 ) -> None:
-    """One scale for a column: where the gap is must be seen at a glance."""
+    """Set one scale for a column of residuals, so that joints can be compared."""
     most = LEAST
     for row in rows:
         if quantity in row.channels:
@@ -252,15 +267,19 @@ def _one_scale(
 
 
 def joint_of(story: Story, kind: str, place: str) -> str:
-    """The joint that a place belongs to: a channel's, an actuator's, a body's; empty where there is
-    none, or no robot.
+    """Return the joint that a place belongs to; empty without a joint or a robot.
+
+    Args:
+        story: Report data.
+        kind: Kind of the place: joint, channel, actuator or body.
+        place: Name of the place.
     """
     robot = story.robot
     if kind == "joint":
         return "" if place == FAMILY else clean(place, 40)
     if kind == "channel":
         quantity, _, name = place.partition(".")
-        # A sensor has a row of its own.
+        # A sensor has its own row.
         return clean(name if quantity in QUANTITIES and name else place, 40)
     if robot is None:
         return ""
@@ -274,18 +293,18 @@ def joint_of(story: Story, kind: str, place: str) -> str:
 
 
 def _joints_of_marks(story: Story) -> set[str]:
-    """Joints of the channels, actuators and bodies that the verdict names."""
+    """Return the joints of the channels, actuators and bodies in the diagnosis."""
     return {joint_of(story, mark.kind, mark.name) for mark in marks(story)}
 
 
 def _finish(
     figure: Figure, axes: Any, story: Story, shot: Shot, rows: Sequence[Row], left: float
 ) -> None:
-    """Title, legend and margins, in inches; the panels begin at `left`."""
+    """Add title, legend and margins; the panels begin at `left` inches."""
     width, height = figure.get_size_inches().tolist()
     total = len(rows_of(story))
     some = f"; the worst {len(rows)} of {total} joints and sensors" if len(rows) < total else ""
-    # A sample counts once, however many channels it has.
+    # A sample time counts once, however many channels were recorded.
     samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
     kind = f"{story.validation_run} run" if shot.held_out else "run"
     how = "that fits worst" if story.verdict.verdict == "adequate" else "with the largest gap"
@@ -294,7 +313,7 @@ def _finish(
     figure.suptitle(title, fontsize=11, x=0.012, ha="left", y=1 - 0.2 / height, va="center")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     with warnings.catch_warnings():
-        # A column of residuals may have none in its first row.
+        # A residual column may have no panel in its first row.
         warnings.simplefilter("ignore", UserWarning)
         bands = [panel.get_legend_handles_labels() for panel in axes[:, 1]]
     band, its_label = next(((h, name) for h, name in bands if h), ([], []))

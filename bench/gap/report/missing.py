@@ -1,7 +1,7 @@
-"""What is missing where a number, fitted apart, moves with something: physics in words.
+"""Physical explanation of a trend: which effect would make a parameter move with a covariate.
 
-A number stands for a law; where it takes another value at another load, speed or time, the law
-holds nowhere but there, and the way in which it moves says which one holds everywhere.
+A parameter belongs to a physical law. If its value depends on load, speed or time, the law is
+incomplete, and the kind of dependence shows which law is missing.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FAMILIES: Mapping[str, tuple[str, ...]] = {
     "inertia": ("mass", "inertia", "armature"),
     "bounce": ("restitution",),
 }
-"""Laws, by how the names of their numbers begin; the first that fits."""
+"""Prefixes of parameter names by law; the first law with a matching prefix applies."""
 _WARMS = "friction that changes with time, as what rubs warms or wears"
 _LOAD = "friction that depends on the load (friction.load)"
 _WAY = "friction that differs by direction (friction.direction)"
@@ -35,7 +35,7 @@ LAWS: Mapping[str, str] = {
     "spring": "a stiffness", "delay": "a delay", "push": "a force", "drive": "a drive",
     "inertia": "an inertia", "bounce": "restitution",
 }  # fmt: skip
-"""In words."""
+"""Names of the laws in words."""
 NAMES: Mapping[tuple[str, Kind], str | tuple[str, str]] = {
     **{
         (law, kind): text
@@ -67,18 +67,20 @@ NAMES: Mapping[tuple[str, Kind], str | tuple[str, str]] = {
     ("inertia", "time"): "a load that changes",
     ("bounce", "speed"): "restitution that depends on speed (restitution.speed)",
 }
-"""What is missing, by law and by what its number moves with; two where growing is not falling."""
+"""Missing effect by law and by covariate of the trend; two texts if an increasing and a decreasing
+parameter have different explanations.
+"""
 
 
 def missing(number: str, kind: Kind, name: str, grows: bool, known: Collection[str]) -> str:
-    """What makes a number move, as a noun; as far as nothing is known, what it depends on.
+    """Name the effect that would explain a trend, or else the dependence itself.
 
     Args:
-        number: its name, of a cause's coefficient with the effect.
-        kind: what it moves with.
-        name: of that, in words.
-        grows: whether it grows with it.
-        known: effects that are in the model already, and cannot be missing.
+        number: Name of the parameter; for a coefficient of a cause, it includes the effect.
+        kind: Category of the covariate.
+        name: Covariate in words.
+        grows: Whether the parameter increases with the covariate.
+        known: Effects in the model already, which cannot be missing.
     """
     bare = number.partition("@")[0]
     family = next((law for law, begins in FAMILIES.items() if bare.startswith(begins)), "")

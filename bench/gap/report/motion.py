@@ -1,6 +1,4 @@
-"""What was measured and simulated, run by run and channel by channel: as a table of the page and as
-a chart with one time axis for all.
-"""
+"""Interactive chart of measured and simulated motion, by run and channel, and its table."""
 
 from __future__ import annotations
 
@@ -26,30 +24,33 @@ from sims.base import Array
 TABLE = "motion"
 """Name of the table, and of the chart."""
 MOST_ROWS = 30_000
-"""Samples of the page, over all runs and channels: the file stays below 3 MB."""
+"""Maximum number of samples on the page, over all runs and channels; the file stays below 3 MB."""
 LEAST_ROWS = 500
-"""Samples of one channel in one run at least; where that is too much, runs are left out."""
+"""Minimum number of samples per channel and run; if that is too many, runs are left out."""
 MOST_AT_FIRST = 8
-"""Channels that are switched on at first, those with the largest gap."""
+"""Maximum number of channels that are visible at first: those with the largest gap."""
 DIGITS = 100.0
-"""Measured and simulated are written to such a part of the noise."""
+"""Resolution of written values, as the noise divided by this number."""
 MEASURED = drawn(BLACK, (), "o")
 BEFORE = drawn(VERMILION, (5.0, 2.0))
 AFTER = drawn(BLUE)
 _LEAST = 3.0
-"""Noises to either side that a panel of residuals shows: noise must fill no panel."""
+"""Minimum half-height of a residual panel in noise standard deviations, so that noise does not fill
+the panel.
+"""
 _TALL, _LOW, _ROW = 250, 190, 190
-"""Pixels: of a motion and its residual one below the other, and of both side by side."""
+"""Heights in pixels: of a motion panel and of a residual panel below it, and of both side by side.
+"""
 
 
 class Drawn(NamedTuple):
-    """A run that the page shows.
+    """Run that the page shows.
 
     Attributes:
-        side: that it is of.
-        row: in it.
-        says: its name, use and gap, for the control.
-        gap: RMS of its residual before, in noises.
+        side: Data split of the run.
+        row: Index of the run in it.
+        says: Name, use and gap of the run, for the selection control.
+        gap: RMS residual of the base model, in units of the noise.
     """
 
     side: Side
@@ -59,15 +60,16 @@ class Drawn(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """The table, the runs and channels in the chart's order, and what was left out.
+    """Table of the chart, with its runs and what was left out.
 
     Attributes:
-        frame: a row for each sample that is shown, as texts.
-        runs: worst first, that of the printed figure before all.
-        stretches: into which the longest run was cut, of each of which the extremes are shown; 0
-            where all samples are.
-        longest: samples of the longest run.
-        absent: runs that are not shown.
+        frame: Table with one row per sample, as text.
+        runs: Runs of the chart, the worst first, but the run of the printed figure before all
+            others.
+        stretches: Number of parts of the longest run of which the extremes are shown; 0 if all
+            samples are shown.
+        longest: Number of samples of the longest run.
+        absent: Number of runs that are not shown.
     """
 
     frame: Table
@@ -78,7 +80,12 @@ class Motion(NamedTuple):
 
 
 def motion(story: Story, most: int = MOST_ROWS) -> Motion:
-    """The samples to show, at most about so many."""
+    """Build the table of samples to show.
+
+    Args:
+        story: Report data.
+        most: Approximate maximum number of samples.
+    """
     runs = _runs(story)
     count = len(story.channels)
     shown = runs[: max(1, most // (LEAST_ROWS * count))]
@@ -94,7 +101,7 @@ def motion(story: Story, most: int = MOST_ROWS) -> Motion:
 
 
 def _runs(story: Story) -> list[Drawn]:
-    """All runs, worst first; that of the printed figure before all."""
+    """List all runs, the worst first, but the run of the printed figure before all others."""
     sigma = np.array([c.sigma for c in story.channels])
     first = worst(story)
     found = []
@@ -113,22 +120,26 @@ def _runs(story: Story) -> list[Drawn]:
 
 
 def _stretches(story: Story, most: int) -> int:
-    """Stretches of a long run: of each the extremes of two or three signals are kept."""
+    """Return the number of parts of a long run: the extremes of two or three signals are kept."""
     return max(1, most // (6 if changed(story) else 4))
 
 
 def extremes(signals: Sequence[Array], stretches: int) -> NDArray[np.intp]:
-    """Places, in order, at which any of the signals is least or largest within a stretch; the first
-    and the last sample too.
+    """Select the samples at which any signal has its minimum or maximum within a part of the run.
+
+    The first and the last sample are included.
 
     Args:
-        signals: (T,) each, NaN where missing.
-        stretches: how many, as equal as may be.
+        signals: Signals (T,), NaN where missing.
+        stretches: Number of parts, of nearly equal length.
+
+    Returns:
+        Sorted indices of the samples.
     """
     size = len(signals[0])
     edges = np.linspace(0, size, stretches + 1).astype(int)[:-1]
     long = np.diff([*edges, size]).max()
-    # A stretch a row, filled up with what is neither least nor largest.
+    # Each row holds one part; shorter parts are padded with values that are never extremes.
     places = np.minimum(edges[:, None] + np.arange(long), size - 1)
     own = places < np.append(edges[1:], size)[:, None]
     rows = np.arange(len(edges))
@@ -141,7 +152,7 @@ def extremes(signals: Sequence[Array], stretches: int) -> NDArray[np.intp]:
 
 
 def _rows(story: Story, run: Drawn, c: int, most: int) -> list[list[str]]:
-    """The cells of a channel of a run, column by column."""
+    """Format the cells of a channel of a run, column by column."""
     side, channel = run.side, story.channels[c]
     times = side.times[run.row]
     whiches = ("before", "after") if changed(story) else ("before",)
@@ -153,7 +164,7 @@ def _rows(story: Story, run: Drawn, c: int, most: int) -> list[list[str]]:
         kept = extremes([observed, *residuals], _stretches(story, most))
     digits = int(np.clip(ceil(log10(DIGITS / channel.sigma)), 0, 15)) if channel.sigma > 0 else 9
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    # A thousandth of a step: stamps that jitter are told from those that do not.
+    # A thousandth of a step shows whether time stamps have jitter.
     fine = int(np.clip(3 - floor(log10(step)), 0, 9)) if step > 0 else 6
     count = len(kept)
     texts = [[clean(side.names[run.row], 80)] * count, [clean(channel.name, 80)] * count]
@@ -163,19 +174,19 @@ def _rows(story: Story, run: Drawn, c: int, most: int) -> list[list[str]]:
 
 
 def _written(values: Array, digits: int) -> list[str]:
-    """Numbers with so many decimals and no more than they need; empty where there is none."""
+    """Format numbers with at most this many decimals; empty for missing values."""
     texts = [f"{value:.{digits}f}" if np.isfinite(value) else "" for value in values.tolist()]
     return [text.rstrip("0").rstrip(".") if "." in text else text for text in texts]
 
 
 def motion_chart(story: Story, shown: Motion, static: Static | None, printed: str) -> Chart:
-    """The chart of the table.
+    """Make the chart of the table.
 
     Args:
-        story: what is told.
-        shown: its table.
-        static: the printed figure.
-        printed: how to read that; safe HTML.
+        story: Report data.
+        shown: Table of the chart.
+        static: Printed figure.
+        printed: Caption of the printed figure; safe HTML.
     """
     panels: list[Panel] = []
     places = _places(story)
@@ -213,7 +224,7 @@ def motion_chart(story: Story, shown: Motion, static: Static | None, printed: st
 
 
 def _places(story: Story) -> list[tuple[dict[str, str], int]]:
-    """What each channel is switched by, joint by joint for a robot."""
+    """Return the switches of each channel; for a robot, joint and quantity."""
     if not by_joint(story):
         return [({"channel": clean(c.name, 40)}, i) for i, c in enumerate(story.channels)]
     found = []
@@ -228,7 +239,7 @@ def _places(story: Story) -> list[tuple[dict[str, str], int]]:
 def _off(
     story: Story, places: Sequence[tuple[dict[str, str], int]], toggle: str
 ) -> tuple[str, ...]:
-    """Of very many channels those that fit well are switched off at first."""
+    """Return the channels that are hidden at first: with many channels, those that fit well."""
     if len(places) <= MOST_AT_FIRST:
         return ()
     gaps: dict[str, float] = {}
@@ -250,7 +261,7 @@ def _off(
 def _pair(
     story: Story, run: Drawn, c: int, facets: dict[str, str], wide: bool
 ) -> tuple[Panel, Panel]:
-    """A channel's motion, and its residual."""
+    """Make the panels of a channel's motion and of its residual."""
     channel = story.channels[c]
     where = {"run": clean(run.side.names[run.row], 80), "channel": clean(channel.name, 80)}
     extended = changed(story)
@@ -262,7 +273,7 @@ def _pair(
     series.append(Series("simulated before", "before", BEFORE, where))
     across = Axis("time [s]", scales=("linear",))
     name = clean(channel.name, 40)
-    # Of a robot's joints one scale shows at a glance where the gap is.
+    # For the joints of a robot, a common scale makes residuals comparable.
     of = facets.get("quantity", name)
     residual = Axis(f"residual of {of} [σ]", scales=("linear",), holds=(-_LEAST, _LEAST))
     up = Axis(labelled(brief(clean(channel.name), 24), channel.unit), scales=("linear",))
@@ -286,7 +297,7 @@ def _pair(
 
 
 def _tells(unit: str, sigma: float, extended: bool) -> tuple[Tell, ...]:
-    """What stands at the cursor: signals in their unit, residuals in noises and in their unit."""
+    """Return the values at the cursor: signals, and residuals in noise units and their unit."""
 
     def residual(says: str, y: str, look: Look) -> Tell:
         return Tell(says, y, "σ", look, sigma, unit)

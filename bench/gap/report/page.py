@@ -1,8 +1,7 @@
-"""The page of an explanation: one file without a network, to work with, and readable without
-scripts and in print.
+"""HTML report of an explanation: one file that needs no network, also readable without scripts.
 
-Ten seconds come first: what is wrong, the gain, what to do next. Every text from a file or
-plugin passes `safe`.
+The most important information comes first: what is wrong, the gain, and what to do next. Every text
+from a file or plugin is escaped by `safe`.
 """
 
 from __future__ import annotations
@@ -57,17 +56,17 @@ _BADGES = {
     "unknown": "unknown: a gap, but no known cause",
     "unidentifiable": "unidentifiable: the data do not suffice",
 }
-"""Every verdict in a few words."""
+"""Short text of every verdict."""
 _CUT = {
     "partial": "partial: a cause is found; the search was ended early",
     "unknown": "unknown: the search was ended early",
 }
-"""The same where the search was ended early."""
+"""Short text of a verdict if the search was stopped early."""
 _FAULTY = "unknown: a unit or a sign of the recording is wrong"
-"""The same where the recording is at fault."""
+"""Short text of the verdict if the recording is faulty."""
 _OPEN = "partial: a cause is found, but its number lies at a bound or has no interval"
 _BORDERING = "partial: a cause is found, but a parameter ends at a bound of its range"
-"""The same where numbers of the causes are not results."""
+"""Short text of the verdict if a base parameter is at a bound of its range."""
 _CAPTIONS = {
     "robot": (
         "The robot in the run below, where it is furthest from its beginning. Blue marks are "
@@ -92,35 +91,35 @@ _CAPTIONS = {
         "probability of such a score by chance. Causes are bold."
     ),
 }
-"""Under the figures."""
+"""Captions of the figures."""
 _SHARES = (
     " Left: the share of the gap on {runs} that each closes by itself, with its 95 % "
     "interval, where it was simulated there."
 )
-"""Under the candidates, where held-out runs were simulated with any of them."""
+"""Addition to the caption of the candidates, if held-out runs were simulated with any of them."""
 _TRACK = "The scene of the film with the ball's track over it, its height and radius over time."
-"""What the picture of a track shows."""
+"""Alternative text of the figure of a ball track."""
 _JOINTS = (
     "A row for each joint; those that the verdict names are blue, behind a pointer. Left: "
     "measured and simulated. Right: what is measured less what is simulated, in units of the "
     "sensor's noise σ and on one scale for all; in the grey band 95 % of the noise would lie."
 )
-"""Under the figure of a robot's run."""
+"""Caption of the figure of a robot's run."""
 _PLACED = (
     " Each effect stands at the place where it explains most; ticks are the same effect elsewhere."
 )
-"""Under the candidates of a robot."""
+"""Addition to the caption of the candidates of a robot."""
 _FEW = 5
-"""Places and candidates that are read aloud in place of a figure."""
+"""Maximum number of places and candidates in an alternative text."""
 
 
 def page(story: Story, drawn: Mapping[str, Printed], folder: Path | None = None) -> str:
-    """The page as HTML.
+    """Render the report as HTML.
 
     Args:
-        story: what is told.
-        drawn: the figures by name; what is not drawn is left out.
-        folder: that the page is written to with the other files; None where it stands alone.
+        story: Report data.
+        drawn: Figures by name; missing ones are left out.
+        folder: Folder in which the report is written with the other files; None for a page alone.
     """
     style = _STYLE.read_text(encoding="utf-8")
     made = Page(f"{headline(story)} {clean(story.title, 80)}", _foot(story), style)
@@ -150,7 +149,7 @@ def page(story: Story, drawn: Mapping[str, Printed], folder: Path | None = None)
 
 
 def _opening(story: Story) -> Iterator[str]:
-    """The ten seconds."""
+    """Yield the header: verdict, headline and the most important facts."""
     yield "<header>\n" + paragraph(safe(story.title), "recording")
     verdict = story.verdict
     badge = _BADGES[verdict.verdict] if verdict.cut is None else _CUT[verdict.verdict]
@@ -163,18 +162,18 @@ def _opening(story: Story) -> Iterator[str]:
     yield paragraph(f'<span class="badge">{badge}</span>')
     yield f"<h1>{safe(headline(story))}</h1>"
     for text in following(story):
-        # Longer than other texts may be: a sentence here lists causes and their numbers.
+        # These sentences list causes and their numbers, so they may be longer than other texts.
         yield paragraph(safe(text, 1000), "lead")
     yield "</header>"
     yield from _gain(story)
 
 
 def _gain(story: Story) -> Iterator[str]:
-    """Bars of the held-out error before, after and of the floor."""
+    """Yield bars of the held-out error before and after, and of the noise floor."""
     held_out = story.verdict.heldout
     if held_out is None:
         return
-    # Without a cause both errors are the same: a second bar would be a false comparison.
+    # Without a cause both errors are equal, so a second bar would be misleading.
     extended = bool(story.verdict.causes)
     rows = [("before", "tuned simulation", held_out.rmse_base)]
     if extended:
@@ -190,7 +189,7 @@ def _gain(story: Story) -> Iterator[str]:
         yield paragraph(closed + interval(held_out), "closed")
     note = f"Error on {runs} (RMSE): shorter is better, the noise floor is best."
     yield paragraph(note, "soft")
-    # Bars are shares of the longest: a simulation that failed has no error, and no bar.
+    # Bars are relative to the longest one; a failed simulation has no error and no bar.
     known = [value for _, _, value in rows if value is not None and isfinite(value)]
     longest = max(known, default=0.0)
     for kind, name, value in rows:
@@ -208,7 +207,7 @@ def _still(story: Story, name: str, figure: Printed) -> Static:
 def _runs(
     made: Page, story: Story, stills: Mapping[str, Static], drawn: Mapping[str, Printed]
 ) -> Iterator[str]:
-    """What was measured and simulated, with the robot or the film's track beside it."""
+    """Yield the chart of measured and simulated motion, next to the robot or the film's track."""
     shown = motion(story)
     made.table(MOTION, shown.frame)
     printed = _JOINTS if by_joint(story) else _CAPTIONS["overview"]
@@ -222,7 +221,7 @@ def _runs(
 
 
 def _robot(made: Page, story: Story, drawn: Mapping[str, Printed]) -> Iterator[str]:
-    """The robot, and a list of the places that the verdict names."""
+    """Yield the figure of the robot, and a list of the diagnosed places."""
     if "robot" not in drawn:
         return
     robot = drawn["robot"]
@@ -239,7 +238,7 @@ def _robot(made: Page, story: Story, drawn: Mapping[str, Printed]) -> Iterator[s
 
 
 def _film(story: Story) -> Iterator[str]:
-    """The picture of the track, of a recording from a film."""
+    """Yield the figure of the track, for a recording from a film."""
     if story.track:
         yield figure(story.track, _TRACK, _CAPTIONS["track"])
 
@@ -247,7 +246,7 @@ def _film(story: Story) -> Iterator[str]:
 def _where(
     made: Page, story: Story, stills: Mapping[str, Static], frames: Mapping[str, Table]
 ) -> Iterator[str]:
-    """Where the gap is, in units of the noise and of each channel."""
+    """Yield the section on where the gap is, in units of the noise and of each channel."""
     if "where" in stills:
         tables = [PLACES] * bool(story.places) + [FOLLOWS] * bool(story.profiles)
         yield made.picture("where-picture", stills["where"], _CAPTIONS["where"], tables)
@@ -262,7 +261,7 @@ def _where(
 def _candidates(
     made: Page, story: Story, stills: Mapping[str, Static], frames: Mapping[str, Table]
 ) -> Iterator[str]:
-    """The candidates with their evidence, and what cannot be told apart."""
+    """Yield the candidates with their evidence, and the sets of indistinguishable causes."""
     yield from sets(story)
     if "candidates" in stills:
         caption = _CAPTIONS["candidates"] + (_PLACED if has_places(story) else "")
@@ -276,7 +275,7 @@ def _candidates(
 
 
 def _alternative(story: Story, name: str) -> str:
-    """What a figure shows, for those who do not see it."""
+    """Return the alternative text of a figure."""
     if name == "robot":
         named = [f"{m.kind} {clean(m.name, 30)} ({clean(m.says, 60)})" for m in marks(story)]
         return f"The robot; marked: {joined(named) or 'nothing'}."
@@ -284,7 +283,7 @@ def _alternative(story: Story, name: str) -> str:
         names = joined([clean(c.name, 30) for c in story.channels])
         what = f"Measured and simulated {names} of the run that fits worst, with the residual."
         return f"{what} {headline(story)}"
-    # Read aloud a few of the largest are enough: the tables below have all.
+    # A few of the largest values suffice, because the tables contain all of them.
     if name == "where":
         worst = worst_first(story.places)[:_FEW]
         sizes = [f"{p.kind} {clean(p.label, 30)} {number(p.before, 2)}" for p in worst]
@@ -297,7 +296,7 @@ def _alternative(story: Story, name: str) -> str:
 
 def _foot(story: Story) -> str:
     all_units = [pretty(c.unit) or "1" for c in story.channels]
-    # Of a robot's many channels each unit is said once.
+    # A robot has many channels, so each unit is listed once.
     units = safe(joined(list(dict.fromkeys(all_units)) if by_joint(story) else all_units), 100)
     recording = f"Recording: {code(safe(story.path, 300))} (channels in {units})."
     return f"{recording} {safe(effort(story))} Made by simgap explain."

@@ -1,4 +1,4 @@
-"""Panels of the figures: places and profiles of the gap; and the look that all figures share."""
+"""Panels of the figures for gap locations and residual profiles, and the style of all figures."""
 
 from __future__ import annotations
 
@@ -16,72 +16,84 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_RUNS = 8
-"""Runs that are shown, the worst."""
+"""Maximum number of runs shown: those with the largest gap."""
 MOST_PLACES = 10
-"""Channels that are shown, and phases, the worst of each."""
+"""Maximum number of channels, and of phases, shown: those with the largest gap."""
 MOST_PROFILES = 4
 MOST_LETTERS = 26
-"""Of the name of a variable or of a channel."""
+"""Maximum number of characters of the name of a variable or of a channel."""
 LONGEST_NAME = 64
-"""Of the name of a run or channel among the places."""
+"""Maximum number of characters of the name of a run or channel among the gap locations."""
 _NAME_LINE = 32
-"""Longest line of such a name, in characters."""
+"""Maximum number of characters per line of the name of a gap location or variable."""
 SHORT = 9
-"""Letters of a unit beside a panel."""
+"""Maximum number of characters of a unit next to a panel."""
 BEFORE: Mapping[str, Any] = {"color": VERMILION, "linestyle": (0, (5, 2)), "linewidth": 1.3}
-"""Curves of the tuned base model: dashed, to be told apart in grey."""
+"""Line style of the fitted base model: dashed, so that it is recognised without colour."""
 AFTER: Mapping[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5}
-"""Curves of the extended model."""
+"""Line style of the extended model."""
 OPEN: Mapping[str, Any] = {
     "marker": "s",
     "markersize": 6,
     "markerfacecolor": "white",
     "color": VERMILION,
 }
-"""Marks of the tuned base model: open squares, to be told apart in grey."""
+"""Marker style of the fitted base model: open squares, recognised without colour."""
 FILLED: Mapping[str, Any] = {"marker": "o", "markersize": 5.5, "color": BLUE}
-"""Marks of the extended model."""
+"""Marker style of the extended model."""
 _SPAN_FOR_LOG = 8.0
-"""Factor between the largest and the least value from which on an axis is logarithmic."""
+"""Minimum ratio of the largest to the smallest value for a logarithmic axis."""
 _FLOOR = "1: noise floor"
 _ALONE = "what noise alone gives"
 _WIDEST = 0.9
-"""Longest bar of chance to either side of 1, so that it ends before 0."""
+"""Maximum half-length of the bar for the noise about 1, so that it ends above 0."""
 _NEXT = 1.0
-"""Distance of a row of places from the one above."""
+"""Distance between rows of gap locations."""
 _NEXT_KIND = 2.1
-"""Distance of the first row of another kind, with room for its heading."""
+"""Distance to the first row of another kind, with space for its heading."""
 _FIRST = 1.0
-"""Where the first row stands."""
+"""Position of the first row."""
 
 
 def label(name: object, unit: str = "1", most: int = 30) -> str:
-    """A text from a file, perhaps with its unit, short enough for a label."""
+    """Format a text from a file, optionally with its unit, short enough for a label.
+
+    Args:
+        name: Text of the label.
+        unit: Unit; ``1`` for none.
+        most: Maximum number of characters of the text.
+    """
     return labelled(clean(name, most), clean(unit, 12))
 
 
 def changed(story: Story) -> bool:
-    """Whether there is an extended model to show beside the base model."""
+    """Return whether there is an extended model to show next to the base model."""
     return bool(story.verdict.causes)
 
 
 def chosen_places(places: Sequence[Place]) -> list[Place]:
-    """Runs, channels and phases to show: the worst of each, in the order in which they were."""
+    """Select the runs, channels and phases with the largest gaps, in their original order."""
     result: list[Place] = []
-    # A part that nothing was recorded in has no size.
+    # A part without samples has no RMS.
     usable = [p for p in places if np.isfinite(p.before) and p.samples > 0]
     for kind, most in (("run", MOST_RUNS), ("channel", MOST_PLACES), ("phase", MOST_PLACES)):
         there = [p for p in usable if p.kind == kind]
         worst = sorted(there, key=lambda p: -p.before)[:most]
-        # Not sorted by size: a reader looks for the third run behind the second.
+        # The original order is kept, because readers look for run 3 after run 2.
         result += [p for p in there if p in worst]
     return result
 
 
 def places_panel(axis: Axes, places: Sequence[Place], story: Story) -> None:
-    """Dots by run, channel and phase, with the stretch that noise alone would give."""
+    """Draw the RMS by run, channel and phase, with the range that noise alone would give.
+
+    Args:
+        axis: Axes to draw on.
+        places: Gap locations to draw.
+        story: Report data.
+    """
     rows = _rows_of(axis, places)
-    # The RMS of n samples of noise scatters by 1 / sqrt(2 n) about 1; drawn are two sigmas.
+    # The RMS of n noise samples has a standard deviation of 1 / sqrt(2 n); two of them are drawn.
     noise = [min(2 / (2 * p.samples) ** 0.5, _WIDEST) for p in places]
     ones = np.ones(len(rows))
     axis.errorbar(ones, rows, xerr=noise, fmt="none", ecolor=CHANCE, elinewidth=7, label=_ALONE)
@@ -94,7 +106,7 @@ def places_panel(axis: Axes, places: Sequence[Place], story: Story) -> None:
     name = "before" if changed(story) else "simulated (tuned)"
     axis.plot(squares, rows, linestyle="", label=name, **OPEN)
     drawn = [*squares, *dots] if changed(story) else squares
-    # The noise floor belongs into view, whatever the sizes.
+    # The noise floor must be visible, whatever the sizes.
     _decades(axis, [*drawn, 1.0])
     axis.set_yticks(rows, place_names(places), linespacing=1.05)
     axis.set_ylim(rows[-1] + 0.7, -0.1)
@@ -102,13 +114,13 @@ def places_panel(axis: Axes, places: Sequence[Place], story: Story) -> None:
 
 
 def place_names(places: Sequence[Place]) -> list[str]:
-    """Name each place with its number of samples, in as many lines as that needs."""
+    """Format each gap location with its number of samples, in as many lines as needed."""
     names = [f"{clean(place.label, LONGEST_NAME)} ({place.samples})" for place in places]
     return [break_name(name, _NAME_LINE) for name in names]
 
 
 def _rows_of(axis: Axes, places: Sequence[Place]) -> list[float]:
-    """The height of each place, downwards; writes a heading above the first of each kind."""
+    """Compute the position of each row downwards, and write a heading above each kind."""
     rows: list[float] = []
     for i, place in enumerate(places):
         new = i == 0 or places[i - 1].kind != place.kind
@@ -131,7 +143,7 @@ def _rows_of(axis: Axes, places: Sequence[Place]) -> list[float]:
 
 
 def in_order(axis: Axes) -> tuple[list[Any], list[str]]:
-    """Handles and labels of a legend in the order in which a reader meets them."""
+    """Return handles and labels of a legend in reading order."""
     handles, labels = axis.get_legend_handles_labels()
     by_label = dict(zip(labels, handles, strict=True))
     order = ("before", "simulated (tuned)", "after", _FLOOR, _ALONE)
@@ -140,7 +152,7 @@ def in_order(axis: Axes) -> tuple[list[Any], list[str]]:
 
 
 def _decades(axis: Axes, values: Sequence[float]) -> None:
-    """A log axis with plain numbers where the values span much."""
+    """Use a logarithmic axis with plain numbers if the values have a large range."""
     there = np.array([v for v in values if np.isfinite(v) and v > 0])
     if not there.size or there.max() / there.min() < _SPAN_FOR_LOG:
         axis.set_xlim(left=0)
@@ -156,8 +168,8 @@ def _decades(axis: Axes, values: Sequence[float]) -> None:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Round numbers between two others, on a log axis."""
-    # The more decades, the fewer numbers in each: labels must not touch.
+    """Return round numbers in an interval of a logarithmic axis."""
+    # With more decades, each has fewer numbers, so that labels do not overlap.
     steps: tuple[int, ...] = (1,)
     if high / low < 200:
         steps = (1, 2, 5)
@@ -173,20 +185,21 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def telling(profiles: Sequence[Profile]) -> list[Profile]:
-    """The profiles in which the residual before stands out most, one for each variable before a
-    second for any.
+    """Select the profiles with the most significant residuals before the extension.
+
+    Each variable comes once before any comes a second time.
     """
     usable = [p for p in profiles if np.isfinite(_standing(p))]
     strongest_first = sorted(usable, key=lambda p: -_standing(p))
     variables = [p.variable for p in strongest_first]
     again = [name in variables[:i] for i, name in enumerate(variables)]
-    # A stable sort by "seen before": first ones come first, each group by strength.
+    # The sort is stable: first profiles of each variable come first, each group by significance.
     order = np.argsort(again, kind="stable")
     return [strongest_first[i] for i in order[:MOST_PROFILES]]
 
 
 def _standing(profile: Profile) -> float:
-    """Mean square of the residual in standard errors, 1 by chance; NaN for too few bins."""
+    """Compute the mean squared residual in standard errors; 1 for noise, NaN for too few bins."""
     there = np.isfinite(profile.before) & (profile.error > 0)
     if there.sum() < 2:
         return float("nan")
@@ -194,7 +207,7 @@ def _standing(profile: Profile) -> float:
 
 
 def profile_label(profile: Profile) -> str:
-    """Name a variable with its unit, in as many lines as that needs."""
+    """Format a variable with its unit, in as many lines as needed."""
     name = labelled(clean(profile.variable, LONGEST_NAME), clean(profile.unit, 12), LONGEST_NAME)
     return break_name(name, _NAME_LINE)
 
@@ -202,16 +215,16 @@ def profile_label(profile: Profile) -> str:
 def profile_panel(
     axis: Axes, profile: Profile, unit: str, extended: bool, *, one_channel: bool = False
 ) -> None:
-    """Draw the mean residual of a channel, with its unit, against a variable.
+    """Draw the mean residual of a channel against a variable.
 
     Args:
-        axis: where.
-        profile: the residual in bins.
-        unit: of the channel.
-        extended: whether there is an extended model to draw.
-        one_channel: whether all panels are of the same channel, which their heading names.
+        axis: Axes to draw on.
+        profile: Residual in bins.
+        unit: Unit of the channel.
+        extended: Whether there is an extended model to draw.
+        one_channel: Whether all panels show the same channel, which their heading names.
     """
-    # Bins without a sample have no mean.
+    # Bins without samples have no mean.
     there = np.isfinite(profile.before)
     centres = profile.centres[there]
     bars = 2 * profile.error[there]

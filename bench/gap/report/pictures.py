@@ -1,8 +1,8 @@
-"""The figures of an explanation: the run with the largest gap, where the gap is, the candidates.
+"""Figures of an explanation: the run with the largest gap, where the gap is, and the candidates.
 
-Made for print and for grey: before is dashed with open squares, after solid with filled circles,
-beside their colours. Each figure is rendered as PNG, and as PDF and SVG where vector graphics are
-asked for (`bench.figures.formats`). Texts from files are never read as mathematics.
+They are readable in print without colour: before is dashed with open squares, and after is solid
+with filled circles. Each figure is rendered as PNG, and as PDF and SVG if vector graphics are
+requested (`bench.figures.formats`). Texts from files are never parsed as mathematics.
 """
 
 from __future__ import annotations
@@ -47,13 +47,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 150
-"""Dots an inch of the PNG files, which the page shows at about two thirds of their size."""
+"""Resolution of the PNG files in dots per inch; the page shows them at about two thirds of their
+size.
+"""
 _WIDTHS = {1: 8.6, 2: 10.0, 3: 12.5}
-"""Inches by the number of channels."""
+"""Width of the overview in inches, by the number of channels."""
 _HEADING = 0.22
-"""Inches from the upper edge to the middle of a heading."""
+"""Distance from the upper edge to the middle of a heading, in inches."""
 _HEADING_SIZE = 11.0
-"""Size of its letters at most, in points."""
+"""Maximum font size of a heading, in points."""
 _STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
@@ -61,13 +63,13 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "legend.frameon": False,
     "text.usetex": False,
-    # Names come from files: a dollar sign in one is a dollar sign.
+    # Names come from files, where a dollar sign must not start mathematics.
     "text.parse_math": False,
 }
 
 
 def names(story: Story) -> tuple[str, ...]:
-    """The figures that a story has: without places or candidates there is nothing to draw."""
+    """List the names of the figures for which there are data."""
     there = {
         "robot": story.robot is not None,
         "overview": True,
@@ -78,24 +80,34 @@ def names(story: Story) -> tuple[str, ...]:
 
 
 def figure(story: Story, name: str) -> Figure:
-    """One figure.
+    """Draw one figure.
+
+    Args:
+        story: Report data.
+        name: One of `names`.
 
     Raises:
-        InputError: the story has none of that name.
+        InputError: There is no figure of that name.
     """
     known = names(story)
     if name not in known:
         raise unknown("figure", name, known)
     with _styled():
         drawn = _MAKERS[name](story)
-        # Ticks take their looks from the settings of the moment in which they are first needed.
+        # Ticks take their style from the settings that are active when they are first drawn.
         drawn.draw_without_rendering()
     return drawn
 
 
 class Printed(NamedTuple):
-    """One figure as the bytes of its files; of a robot's where its joints are: names with shares of
-    its width and height from above left. `pdf` and `svg` are None where no PDF is asked for.
+    """Rendered figure as the bytes of its files.
+
+    Attributes:
+        png: PNG file.
+        pdf: PDF file; None if no PDF is requested.
+        svg: SVG file; None if no PDF is requested.
+        spots: For a robot, its joints: name, and position as shares of width and height from the
+            upper left corner.
     """
 
     png: bytes
@@ -105,9 +117,9 @@ class Printed(NamedTuple):
 
 
 def printed(story: Story) -> dict[str, Printed]:
-    """Draw every figure that a story has, and render its files; by name."""
+    """Draw all figures and render their files, by name."""
     with _styled():
-        # Within the settings: text is laid out once more when a figure is written.
+        # The settings must stay active, because text is laid out again when a figure is written.
         figures = {name: _MAKERS[name](story) for name in names(story)}
         made = {}
         for name, drawn in figures.items():
@@ -121,17 +133,22 @@ def printed(story: Story) -> dict[str, Printed]:
 
 @contextmanager
 def _styled() -> Iterator[None]:
-    """The settings of these figures, for as long as they are made or written."""
+    """Apply the style settings while figures are drawn or written."""
     from matplotlib import rc_context
 
     with rc_context(_STYLE), warnings.catch_warnings():
-        # A title may be in any script; what the font lacks is drawn as a box.
+        # A title may be in any script; characters that the font lacks are drawn as boxes.
         warnings.filterwarnings("ignore", message="Glyph")
         yield
 
 
 def pose(story: Story, shot: Shot) -> dict[str, float]:
-    """Positions of joints where a run is furthest from its beginning; those that were recorded."""
+    """Return recorded joint positions at the sample of a run that is farthest from its start.
+
+    Args:
+        story: Report data.
+        shot: Run to use.
+    """
     joints, columns = [], []
     for c, channel in enumerate(story.channels):
         kind, _, joint = channel.name.partition(".")
@@ -147,7 +164,7 @@ def pose(story: Story, shot: Shot) -> dict[str, float]:
 
 
 def _robot(story: Story) -> Figure:
-    """The robot in the run that is shown, bent as far as it is there."""
+    """Draw the robot in the extreme pose of the run that is shown."""
     if story.robot is None:
         raise InputError(f"{story.path}: no robot was recorded")
     return robot_figure(story.robot, pose(story, worst(story)), marks(story))
@@ -162,14 +179,14 @@ def _overview(story: Story) -> Figure:
     figure, axes = blank(2, count, size, layout=None, sharex=True, height_ratios=(3, 2))
     for column, c in enumerate(shot.channels):
         _signal(axes[0][column], axes[1][column], story, shot, c)
-    # A sample counts once, however many channels it has.
+    # A sample time counts once, however many channels were recorded.
     samples = int(np.isfinite(shot.side.observed[shot.row]).any(axis=1).sum())
     kind = f"{story.validation_run} run" if shot.held_out else "run"
     how = "that fits worst" if story.verdict.verdict == "adequate" else "with the largest gap"
     some = f"; {count} of {len(story.channels)} channels" if count < len(story.channels) else ""
     title = f"The {kind} {how}: {label(shot.side.names[shot.row])} ({samples} samples{some})"
     figure.suptitle(title, fontsize=11, y=0.985)
-    # One legend for all: the columns differ in the channel alone.
+    # The columns differ only in the channel, so they share one legend.
     handles, labels = axes[0][0].get_legend_handles_labels()
     band, its_label = axes[1][0].get_legend_handles_labels()
     figure.legend([*handles, *band], [*labels, *its_label], loc="lower center", ncols=4, fontsize=9)
@@ -179,10 +196,10 @@ def _overview(story: Story) -> Figure:
 
 
 def _signal(above: Axes, below: Axes, story: Story, shot: Shot, c: int) -> None:
-    """One channel: measured and simulated, and under it what the simulation leaves."""
+    """Draw the measured and simulated signal of a channel, and the residual below it."""
     channel, side = story.channels[c], shot.side
     times = side.times[shot.row]
-    # Behind the end of a shorter run there is nothing.
+    # Arrays are padded after the end of a shorter run.
     signals = [a[shot.row, : len(times), c] for a in (side.observed, side.before, side.after)]
     rows = kept(signals[0])
     t = times[rows]
@@ -190,7 +207,7 @@ def _signal(above: Axes, below: Axes, story: Story, shot: Shot, c: int) -> None:
 
     size = 3.6 if rows.size < 250 else 2.6
     marks: dict[str, Any] = {"color": "black", "markersize": size, "markeredgewidth": 0}
-    # Thousands of outlines would be most of a page.
+    # Thousands of vector outlines would dominate the file size.
     marks["rasterized"] = rows.size > MOST_OUTLINES
     above.plot(t, measured, "o", label="measured", zorder=4, **marks)
     tuned = "simulated before (tuned)" if changed(story) else "simulated (tuned)"
@@ -200,7 +217,7 @@ def _signal(above: Axes, below: Axes, story: Story, shot: Shot, c: int) -> None:
     below.axhline(0, color=ZERO, linewidth=0.6, zorder=1)
     below.plot(t, measured - before, zorder=3, **{**BEFORE, "linewidth": 1.0})
     if changed(story):
-        # Wide and behind: where both agree, before is seen dashed upon after.
+        # The wide curve is behind: where both agree, "before" is visible as dashes on it.
         above.plot(t, after, label="simulated after", zorder=2, **{**AFTER, "linewidth": 3.2})
         below.plot(t, measured - after, zorder=2, **{**AFTER, "linewidth": 0.8})
 
@@ -210,23 +227,23 @@ def _signal(above: Axes, below: Axes, story: Story, shot: Shot, c: int) -> None:
     above.margins(x=0.01)
     for axis in (above, below):
         axis.locator_params(nbins=6)
-    # Noise fills no panel: its band must be seen as narrow.
+    # Noise must not fill the panel: its band should look narrow.
     _at_least(below, 3 * channel.sigma)
 
 
 def _at_least(axis: Axes, size: float) -> None:
-    """Widen a vertical axis to so much to either side of zero."""
+    """Extend a vertical axis to at least this size on both sides of zero."""
     low, high = axis.get_ylim()
     axis.set_ylim(min(low, -size), max(high, size))
 
 
 class _Sheet(NamedTuple):
-    """A figure laid out in inches, so that margins stay as they are while it grows.
+    """Figure layout in inches, so that margins do not change with the figure size.
 
     Attributes:
-        figure: what is laid out.
-        width: of it.
-        height: of it.
+        figure: Figure that is laid out.
+        width: Width in inches.
+        height: Height in inches.
     """
 
     figure: Figure
@@ -234,15 +251,20 @@ class _Sheet(NamedTuple):
     height: float
 
     def across(self, inches: float) -> float:
-        """A distance from the left as a share of the width."""
+        """Convert a distance from the left edge in inches to a share of the width."""
         return inches / self.width
 
     def up(self, inches: float) -> float:
-        """A distance from below as a share of the height."""
+        """Convert a distance from the lower edge in inches to a share of the height."""
         return inches / self.height
 
     def heading(self, inches: float, text: str) -> None:
-        """Write a heading that begins so far from the left, in letters that are small enough."""
+        """Write a heading at a distance from the left edge, in a font size that fits.
+
+        Args:
+            inches: Distance from the left edge.
+            text: Text of the heading.
+        """
         room = self.width - inches - 0.1
         size = _HEADING_SIZE * min(1.0, room / text_width([text], _HEADING_SIZE))
         y = 1 - self.up(_HEADING)
@@ -250,23 +272,23 @@ class _Sheet(NamedTuple):
 
 
 _NAMES = 1.9
-"""Least room for the names of places, in inches."""
+"""Minimum width for the names of places, in inches."""
 _PROFILES_AFTER = 4.1
-"""Inches from the end of these names to the profiles."""
+"""Distance from the end of the names of places to the profiles, in inches."""
 
 
 def _where(story: Story) -> Figure:
-    """Left the places, right the profiles that tell most."""
+    """Draw the gap locations on the left, and the most informative profiles on the right."""
     places, profiles = chosen_places(story.places), telling(story.profiles)
     rows = min(2, len(profiles))
     columns = -(-len(profiles) // 2)
     names = place_names(places)
     left = max(_NAMES, 0.25 + text_width(names, _STYLE["font.size"]))
     profiles_from = left + _PROFILES_AFTER
-    # A single column of profiles gets more width than one of several.
+    # A single column of profiles is wider than one of several columns.
     width = left + 3.3 + (3.1 * columns if columns != 1 else 4.4)
     row = 0.27 + 0.13 * (most_lines(names) - 1)
-    # Variables of robots have long names, in several lines below their panels.
+    # Variables of robots have long names, which need several lines below the panels.
     more = 0.15 * (most_lines([profile_label(profile) for profile in profiles]) - 1)
     height = max(2.6 + row * len(places), 1.5 + (1.9 + more) * rows)
     figure, axes = blank(1, 1, (width, height), layout=None)

@@ -1,8 +1,4 @@
-"""Causes at the places of a robot as people say them: what is lacking, what is wrong, and sets of
-places that the data cannot tell apart.
-
-Names without a place read as they always did.
-"""
+"""Text of causes and their places: missing effects, wrong values and indistinguishable sets."""
 
 from __future__ import annotations
 
@@ -33,32 +29,34 @@ from sims.extended import Number
 from sims.robot.causes import GRAVITY_COMPENSATED
 
 MOST_NAMED = 6
-"""Members of a set that a sentence names; of more it says how many."""
+"""Maximum number of members of a set that a sentence names; the remaining ones are counted."""
 ADDED = frozenset({"drag.linear", "drag.quadratic", "friction.coulomb", "spring.linear"})
-"""Effects whose coefficient is a difference from what the file states."""
+"""Effects whose coefficient is a difference from the value in the model file."""
 _MORE = {True: "larger", False: "smaller"}
 
 
 def of_set(names: Sequence[str], last: str = "or") -> str:
-    """Effects as people list them: ``Coulomb friction at any of the joints a, b or c``, ``linear
-    drag or Coulomb friction at joint elbow``.
+    """Format a set of effects.
+
+    For example ``Coulomb friction at any of the joints a, b or c``, or ``linear drag or Coulomb
+    friction at joint elbow``.
 
     Args:
-        names: of effects.
-        last: ``or`` where one of them is meant, ``and`` for all.
+        names: Names of the effects.
+        last: ``or`` if one of them is meant, ``and`` for all.
     """
     if not any("@" in name for name in names):
         return joined([noun(name) for name in names], last)
     parts = _grouped(names, last)
     if len(parts) > MOST_NAMED:
         parts = [*parts[: MOST_NAMED - 1], f"one of {len(parts) - MOST_NAMED + 1} others"]
-    # Lists within a list are set apart by a comma before the last word too.
+    # Nested lists are separated by a comma before the last conjunction too.
     nested = len(parts) > 1 and any(f" {last} " in part for part in parts)
     return f", {last} ".join(parts) if nested else joined(parts, last)
 
 
 def _grouped(names: Sequence[str], last: str) -> list[str]:
-    """One text for an effect at several places, else for several effects at one."""
+    """Format one text for an effect at several places, or for several effects at one place."""
     by_effect: dict[str, list[str]] = {}
     for name in names:
         base, place = parted(name)
@@ -67,7 +65,7 @@ def _grouped(names: Sequence[str], last: str) -> list[str]:
     for group in by_effect.values():
         _, place = parted(group[0])
         alone = len(group) == 1 and place not in ("", FAMILY)
-        # A family stands last, behind the single places.
+        # A family comes last, after the single places.
         group.sort(key=lambda name: parted(name)[1] == FAMILY)
         key = f"{kind_of(group[0])} {place}" if alone else group[0]
         by_place.setdefault(key, []).extend(group)
@@ -75,7 +73,7 @@ def _grouped(names: Sequence[str], last: str) -> list[str]:
 
 
 def _together(group: Sequence[str], last: str) -> str:
-    """A group of one effect, or of one place."""
+    """Format a group of one effect, or of one place."""
     if len(group) == 1:
         return noun(group[0])
     bases = list(dict.fromkeys(parted(name)[0] for name in group))
@@ -89,14 +87,15 @@ def _together(group: Sequence[str], last: str) -> str:
 
 
 def lacks(causes: Sequence[Cause]) -> str:
-    """What a simulation lacks and what it has wrong, to stand behind it: ``lacks wind, and linear
-    drag or Coulomb friction``; causes that have alternatives come last.
+    """Format what a simulation lacks and has wrong; causes with alternatives come last.
+
+    For example ``lacks wind, and linear drag or Coulomb friction``.
     """
     lacking: list[str] = []
     wrong: list[str] = []
     either: list[str] = []
     certain = [cause.effect for cause in causes if not cause.alternatives]
-    # Causes that are certain share one list; each open one is a list with "or" of its own.
+    # Causes without alternatives share one list; each other cause has its own "or" list.
     for part, into in ((False, lacking), (True, wrong)):
         if names := [name for name in certain if is_wrong(name) == part]:
             into.append(joined([noun(name) for name in names]))
@@ -116,8 +115,9 @@ def lacks(causes: Sequence[Cause]) -> str:
 
 
 def listed(causes: Sequence[Cause]) -> str:
-    """The causes, those that have alternatives last: ``wind, and linear drag or Coulomb
-    friction``.
+    """Format the causes; those with alternatives come last.
+
+    For example ``wind, and linear drag or Coulomb friction``.
     """
     sure = [noun(cause.effect) for cause in causes if not cause.alternatives]
     parts = [joined(sure)] if sure else []
@@ -126,8 +126,9 @@ def listed(causes: Sequence[Cause]) -> str:
 
 
 def sized(cause: Cause) -> str:
-    """A number of the model file and how wrong it is, as a clause: ``the mass of body forearm is
-    12 % larger than the model file says``; empty for what is no such number.
+    """Format how wrong a value of the model file is, as a clause; empty for other causes.
+
+    For example ``the mass of body forearm is 12 % larger than the model file says``.
     """
     base, place = parted(cause.effect)
     if cause.says == GRAVITY_COMPENSATED:
@@ -142,7 +143,7 @@ def sized(cause: Cause) -> str:
 
 
 def too_much(cause: Cause) -> bool:
-    """Whether the file states more of a friction, a damping or a spring than there is."""
+    """Return whether the model file has too much friction, damping or stiffness."""
     values = [n.value for n in cause.coefficients.values()]
     base, place = parted(cause.effect)
     return bool(place) and base in ADDED and bool(values) and max(values) < 0
@@ -177,17 +178,19 @@ _SIZED: Mapping[str, Callable[[str, Sequence[Number]], str]] = {
     "inertia.armature": _difference("armature"),
     "mass.offset": _moved,
 }
-"""How wrong a number of the file is, by effect."""
+"""Functions that format how wrong a value of the model file is, by effect."""
 _STEPPED = {
     "numerics.step": "the time step of the model file is too long",
     "numerics.integrator": "the integrator of the model file does not follow the motion",
 }
-"""The same of how the file has the robot stepped; what mends it is said by the cause."""
+"""Description of a too coarse time step or integrator of the model file; the cause names the
+correction.
+"""
 
 
 def values_of(cause: Cause) -> list[tuple[str, str]]:
-    """The numbers of a cause by their names, with their intervals and units."""
-    # What mends the integration was chosen, and is no estimate; an integrator is no number.
+    """List the coefficients of a cause by name, with their intervals and units."""
+    # The corrected step was chosen, not estimated, and an integrator is not a number.
     if cause.effect == "numerics.integrator":
         return []
     if cause.effect == "numerics.step":
@@ -197,28 +200,28 @@ def values_of(cause: Cause) -> list[tuple[str, str]]:
 
 
 def said_values(cause: Cause) -> str:
-    """The same in a row; those of a family with their places."""
+    """Format the coefficients of a cause in one line; those of a family with their places."""
     texts = []
     for name, text in values_of(cause):
         own, place = parted(name)
-        # Of a family of effects with one coefficient each, the place says which.
+        # If each member of a family has one coefficient, its place identifies it.
         front = "" if place and own == "coefficient" else f"{own} "
         texts.append(f"{front}{text}" + (f" at {place}" if place else ""))
     return joined(texts)
 
 
 def without_place(says: str) -> str:
-    """What an effect does, without the place in brackets that its noun names already."""
+    """Remove the place in brackets from a description, because its noun names the place already."""
     return re.sub(r" \(at [^()]*\)$", "", says)
 
 
 def has_places(story: Story) -> bool:
-    """Whether anything of the story stands at a place."""
+    """Return whether any candidate acts at a place."""
     return any("@" in candidate.effect for candidate in story.verdict.candidates)
 
 
 def marks(story: Story) -> list[Mark]:
-    """The places that the verdict names, to be marked on the robot."""
+    """List the diagnosed places, to be marked on the robot."""
     found: dict[tuple[str, str, str], Mark] = {}
     for cause in story.verdict.causes:
         alone = not cause.alternatives
@@ -226,13 +229,13 @@ def marks(story: Story) -> list[Mark]:
             said, kind = name_of(parted(name)[0]), kind_of(name)
             for place in _places(story, name, cause):
                 size = _size(cause, name, place) if name == cause.effect else ""
-                # A family and a place of it are the same there: once is enough.
+                # A family and one of its places give the same mark, which is kept once.
                 found.setdefault((kind, place, said), Mark(kind, place, f"{said}{size}", alone))
     return list(found.values())
 
 
 def _places(story: Story, effect: str, cause: Cause) -> list[str]:
-    """The places of an effect: those of a family's coefficients, else all of its kind."""
+    """List the places of an effect: those of a family's coefficients, else all of its kind."""
     _, place = parted(effect)
     if place != FAMILY:
         return [place] if place else []
@@ -249,7 +252,7 @@ def _places(story: Story, effect: str, cause: Cause) -> list[str]:
 
 
 def _size(cause: Cause, effect: str, place: str) -> str:
-    """The number of a cause with one coefficient, for a label."""
+    """Format the coefficient of a cause at a place for a label; empty for several coefficients."""
     there = [n for name, n in cause.coefficients.items() if parted(name)[1] in ("", place)]
     if len(there) != 1:
         return ""

@@ -1,4 +1,4 @@
-"""The candidates in their order; those of one effect at several places as one."""
+"""Order of the candidates; an effect at several places forms one entry."""
 
 from __future__ import annotations
 
@@ -10,22 +10,27 @@ from bench.gap.report.words import FAMILY, at, clean, kind_of, name_of, parted
 from bench.gap.verdict import Candidate
 
 MOST_CANDIDATES = 12
-"""That a figure shows."""
+"""Maximum number of candidates that a figure shows."""
 MUCH = 1.3
-"""A family that scores so many times the best of its places stands for its effect."""
+"""Minimum ratio of a family's score to that of its best place for the family to represent the
+effect.
+"""
 
 
 class Entry(NamedTuple):
-    """A candidate that stands for its effect, and the same effect at other places, the best
-    first.
-    """
+    """Candidate that represents its effect, and the other places of that effect, best first."""
 
     best: Candidate
     elsewhere: tuple[Candidate, ...] = ()
 
 
 def standing(story: Story, effect: str) -> str:
-    """Whether an effect is found, one of a set that cannot be told apart, or neither."""
+    """Return the status of an effect: found, found but indistinguishable, or not needed.
+
+    Args:
+        story: Report data.
+        effect: Name of the effect.
+    """
     for cause in story.verdict.causes:
         if effect in (cause.effect, *cause.alternatives):
             return "found, but cannot be told apart" if cause.alternatives else "found"
@@ -33,8 +38,9 @@ def standing(story: Story, effect: str) -> str:
 
 
 def entries(story: Story) -> list[Entry]:
-    """All candidates, the highest score first: each for itself where none has a place, else an
-    entry for each effect and one for each cause.
+    """List all candidates as entries, the highest score first.
+
+    Without places each candidate is an entry. Otherwise each effect and each cause is one entry.
     """
     ordered = sorted(story.verdict.candidates, key=lambda c: c.score, reverse=True)
     if not has_places(story):
@@ -45,7 +51,7 @@ def entries(story: Story) -> list[Entry]:
         groups.setdefault(parted(candidate.effect)[0], []).append(candidate)
     found = []
     for group in groups.values():
-        # What is found stands for its effect, however much another place scores; of several, each.
+        # A diagnosed cause represents its effect even if another place has a higher score.
         heads = [c for c in group if c.effect in causes] or [_head(group)]
         rest = tuple(c for c in group if c not in heads)
         found += [Entry(heads[0], rest), *(Entry(head) for head in heads[1:])]
@@ -53,26 +59,26 @@ def entries(story: Story) -> list[Entry]:
 
 
 def _head(group: list[Candidate]) -> Candidate:
-    """The best place, unless all places together explain much more: they always explain as much."""
+    """Return the best place, unless the family explains much more; it explains at least as much."""
     one = next((c for c in group if parted(c.effect)[1] != FAMILY), group[0])
     return one if group[0].score < MUCH * max(one.score, 1.0) else group[0]
 
 
 def ranked(story: Story) -> list[Candidate]:
-    """The candidates to show, the highest score first; what is found is among them."""
+    """Select the candidates to show, the highest score first; diagnosed causes are included."""
     ordered = [entry.best for entry in entries(story)]
-    # What is found stays, however low it scores beside what it made needless.
+    # A diagnosed cause is shown even with a low score.
     others = [c for c in ordered if standing(story, c.effect) == "not needed"]
     beyond = others[max(0, MOST_CANDIDATES - len(ordered) + len(others)) :]
     return [c for c in ordered if c not in beyond]
 
 
 LONGEST_PLACE = 64
-"""Characters of a place's name that a list shows."""
+"""Maximum number of characters of a place's name in a list."""
 
 
 def short_name(effect: str) -> str:
-    """Name an effect for a list: without its article, and without the kind of its place."""
+    """Format an effect for a list: without its article, and without the kind of its place."""
     base, place = parted(effect)
     if not place:
         return name_of(effect)

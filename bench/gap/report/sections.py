@@ -1,6 +1,4 @@
-"""Sections of the page below what one sees first: why, channels, sets, numbers, what remains, how
-to read it.
-"""
+"""Further sections of the page: reasons, channels, sets, numbers, lack of fit and reading guide."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ _LEFT = {
     "unknown": "Structure that no known cause explains",
     "unidentifiable": "What the simulation lacks is open",
 }
-"""What the residual is called where the verdict leaves something open."""
+"""Description of the residual for verdicts that leave something open."""
 _ALIKE = "change these runs so much alike that either explains them equally well."
 _READING = {
     "RMSE, RMS": "root mean square: the typical size of the error.",
@@ -50,24 +48,24 @@ _READING = {
         "evidence for a cause, and how probable as much is by chance where nothing is missing."
     ),
 }
-"""The words of the page, half a line each."""
+"""Terms of the page with short explanations."""
 _DRAWN = 180.0
-"""Width of the drawn intervals, of 200 with a margin for the marks."""
+"""Width of the drawn intervals; the drawing is 200 wide, with margins for the marks."""
 
 
 def why(story: Story) -> Iterator[str]:
-    """Why the verdict is what it is."""
+    """Yield the reasons for the verdict."""
     if story.why:
         yield listed(safe(sentence(text)) for text in story.why)
 
 
 def worst_first(places: Sequence[Place]) -> list[Place]:
-    """The places, the largest gap first."""
+    """Sort the gap locations by the size of the gap, largest first."""
     return sorted((p for p in places if isfinite(p.before)), key=lambda p: -p.before)
 
 
 def channels(story: Story) -> Iterator[str]:
-    """The channels with their noise and their errors in their own units."""
+    """Yield the table of channels with their noise and their errors in their own units."""
     extended = bool(story.verdict.causes)
     whens = (" before", " after") if extended else ("",)
     kinds = [("fitted", story.fitting), (story.validation_run, story.held_out)]
@@ -87,19 +85,19 @@ def channels(story: Story) -> Iterator[str]:
 
 
 def errors_of(side: Side) -> Array:
-    """(C, 2) RMSE of each channel before and after, in its unit; NaN where nothing was seen."""
+    """Compute each channel's RMSE (C, 2) before and after, in its unit; NaN without samples."""
     errors = np.full((side.observed.shape[2], 2), np.nan)
     for column, simulated in enumerate((side.before, side.after)):
         for c in range(len(errors)):
             left = (side.observed - simulated)[:, :, c]
-            # The mean of nothing would warn.
+            # The mean of an empty set would cause a warning.
             if np.isfinite(left).any():
                 errors[c, column] = np.sqrt(np.nanmean(left**2))
     return errors
 
 
 def sets(story: Story) -> Iterator[str]:
-    """The causes that cannot be told apart, set by set."""
+    """Yield the sets of indistinguishable causes."""
     for cause in story.verdict.causes:
         if cause.alternatives:
             members = safe(_set(story, cause), 1000)
@@ -107,7 +105,7 @@ def sets(story: Story) -> Iterator[str]:
 
 
 def _set(story: Story, cause: Cause) -> str:
-    """The members of a set with their scores and gains: they are too close for these data."""
+    """Format the members of a set of indistinguishable causes, with scores and held-out gains."""
     by_effect = {c.effect: c for c in story.verdict.candidates}
     members = []
     if any("@" in name for name in (cause.effect, *cause.alternatives)):
@@ -123,7 +121,7 @@ def _set(story: Story, cause: Cause) -> str:
 
 
 def numbers(story: Story) -> Iterator[str]:
-    """What was found in numbers."""
+    """Yield the table of the causes with their fitted numbers."""
     rows = []
     for cause in story.verdict.causes:
         what = [safe(noun(cause.effect)), safe(without_place(cause.says))]
@@ -136,11 +134,11 @@ def numbers(story: Story) -> Iterator[str]:
 
 
 def parameters(story: Story) -> Iterator[str]:
-    """How the simulator's own parameters move."""
+    """Yield the table of the changes of the base parameters."""
     if not story.parameters:
         return
     extended = bool(story.verdict.causes)
-    # Where nothing was found nothing could have been absorbed.
+    # Without a cause, nothing could have been absorbed.
     bent = [p for p in story.parameters if p.touched and absorbed(p)]
     if bent and extended:
         yield paragraph(
@@ -152,7 +150,7 @@ def parameters(story: Story) -> Iterator[str]:
         heads.append("before above, after below")
     rows = []
     for p in story.parameters:
-        # Where nothing was found the last fit is of the base model, too, and the best one.
+        # Without a cause, the last fit is also of the base model, and is the best one.
         row = [safe(p.name, 60), _tuned(p, 0 if extended else 1)]
         if extended:
             row += [_tuned(p, 1), safe(_move(p)), _intervals(p)]
@@ -161,8 +159,8 @@ def parameters(story: Story) -> Iterator[str]:
 
 
 def _tuned(p: Tuned, when: int) -> str:
-    """A parameter before (0) or after (1)."""
-    # What the data do not touch was not estimated: it is no number of theirs.
+    """Format a parameter before (0) or after (1)."""
+    # An insensitive parameter was not estimated from the data.
     if not p.touched:
         return safe(with_unit(number(p.before[0]), p.unit)) + ", nominal: not touched by the data"
     return safe(tuned(p, when))
@@ -176,10 +174,10 @@ def _move(p: Tuned) -> str:
 
 
 def _intervals(p: Tuned) -> str:
-    """The two intervals, one above the other: before dashed and open, after solid and filled."""
+    """Draw the two intervals: before above, dashed and open; after below, solid and filled."""
     if not np.isfinite([*p.before, *p.after]).all():
         return ""
-    # One scale for both, or they could not be compared.
+    # A common scale makes them comparable.
     low = min(p.before[1], p.after[1])
     high = max(p.before[2], p.after[2])
     scale = _DRAWN / (high - low) if high > low else 0.0
@@ -195,11 +193,11 @@ def _intervals(p: Tuned) -> str:
 
 
 def remains(story: Story) -> Iterator[str]:
-    """What is left unexplained."""
+    """Yield what remains unexplained."""
     if story.remains:
         yield listed(safe(sentence(text)) for text in story.remains)
         return
-    # On held-out runs the residual owes nothing to the fit.
+    # Nothing was fitted to the residual of held-out runs, except initial states.
     side, name = story.fitting, "fitted"
     if story.held_out:
         side, name = story.held_out, story.validation_run
@@ -210,7 +208,7 @@ def remains(story: Story) -> Iterator[str]:
 
 
 def reading(story: Story) -> Iterator[str]:
-    """The words of the page."""
+    """Yield the explanations of the terms on the page."""
     yield "<dl>"
     validations = {"held-out runs", "runs left out in turn"}
     for word, meaning in _READING.items():

@@ -1,4 +1,4 @@
-"""Which run a figure shows, and which of its samples are drawn."""
+"""Choice of the run that a figure shows, and of the samples that are drawn."""
 
 from __future__ import annotations
 
@@ -14,16 +14,21 @@ from bench.gap.report.story import Side, Story
 from sims.base import Array
 
 MOST_POINTS = 3000
-"""Samples of a run that are drawn; of a longer one the extremes of each part are."""
+"""Maximum number of samples drawn of a run; of a longer run the extremes of each part are drawn."""
 MOST_OUTLINES = 1000
-"""Dots that are drawn as outlines; more are pixels, in vector files too."""
+"""Maximum number of dots drawn as vector outlines; more dots are rasterised in vector files too."""
 MOST_CHANNELS = 3
-"""Channels of the run that are shown, the worst."""
+"""Maximum number of channels shown: those with the largest residuals."""
 
 
 class Shot(NamedTuple):
-    """The run that is shown: its side, its row, whether it is held out, and its channels, the worst
-    first.
+    """Run that a figure shows.
+
+    Attributes:
+        side: Data split of the run.
+        row: Index of the run in it.
+        held_out: Whether the run is held out.
+        channels: Indices of the channels to show.
     """
 
     side: Side
@@ -33,12 +38,12 @@ class Shot(NamedTuple):
 
 
 def worst(story: Story) -> Shot:
-    """The run with the largest gap in units of the noise, a held-out one if there is any."""
+    """Select the run with the largest gap in units of the noise, a held-out one if there is any."""
     side = sides(story)[-1]
     sigma = np.array([c.sigma for c in story.channels])
     squares = ((side.observed - side.before) / sigma) ** 2
     with warnings.catch_warnings():
-        # A run or channel without a sample has no mean, and is not the worst.
+        # The mean of a run or channel without samples is NaN, which counts as zero.
         warnings.simplefilter("ignore", RuntimeWarning)
         row = int(np.argmax(np.nan_to_num(np.nanmean(squares, axis=(1, 2)))))
         by_channel = np.nan_to_num(np.nanmean(squares[row], axis=0))
@@ -47,13 +52,11 @@ def worst(story: Story) -> Shot:
 
 
 def kept(values: Array) -> NDArray[np.intp]:
-    """Places of at most about `MOST_POINTS` samples that look the same: the least and largest of
-    each stretch.
-    """
+    """Select about `MOST_POINTS` samples at most: minimum and maximum of each part of the run."""
     if values.size <= MOST_POINTS:
         return np.arange(values.size)
     edges = np.linspace(0, values.size, MOST_POINTS // 2 + 1).astype(int)
-    # A missing sample is neither the least nor the largest.
+    # A missing sample is neither minimum nor maximum.
     low, high = np.nan_to_num(values, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
     chosen = []
     for begin, end in pairwise(edges):

@@ -1,4 +1,4 @@
-"""Shows the gap: how far above the noise, in which runs, channels, phases, and what it follows."""
+"""Residual analysis: size of the gap by run, channel and phase, and residual profiles."""
 
 from __future__ import annotations
 
@@ -16,37 +16,51 @@ if TYPE_CHECKING:
     from sims.robot.model import Robot
 
 BINS = 12
-"""Of a profile."""
+"""Number of bins of a profile."""
 TAILS = 0.005
-"""Share of the samples to either side that a profile's bins leave out: they would stretch it."""
+"""Share of the samples at either end that a profile's bins leave out, because outliers would
+stretch the axis.
+"""
 SLOW = 0.05
-"""Share of the largest speed below which a motion turns round."""
+"""Speed, as a share of the largest one, below which a motion counts as a reversal."""
 QUIET = 0.01
-"""Share of the largest speed below which, for a while, it is at rest."""
+"""Speed, as a share of the largest one, below which a motion counts as at rest if it lasts."""
 REST = 5
-"""Samples in a row for which something must hold to last."""
+"""Minimum number of consecutive samples for a lasting state."""
 EXTREME = 0.999
-"""Share of its largest value from which on an input is at its extreme."""
+"""Share of its largest magnitude above which an input counts as saturated."""
 NEAR_IMPACT = 2
-"""Samples to either side of an impact that belong to it."""
+"""Number of samples before and after an impact that belong to it."""
 
 
 def side(world: World, before: Array, after: Array) -> Side:
-    """The runs of a world with two simulations of them."""
+    """Return the runs of a run evaluator with two simulations of them.
+
+    Args:
+        world: Run evaluator of the runs.
+        before: (R, T, C) simulated by the base model.
+        after: (R, T, C) simulated by the extended model.
+    """
     names = tuple(track.name for track in world.tracks)
     times = tuple(track.scenario.times for track in world.tracks)
     return Side(names, times, world.observed, before, after)
 
 
 def places(world: World, before: Array, after: Array, sigma: Array, mark: str = "") -> list[Place]:
-    """RMS of the residual in units of the noise, by run, channel and phase; `mark` is set behind
-    names of runs.
+    """Compute the RMS residual in units of the noise, by run, channel and phase.
+
+    Args:
+        world: Run evaluator of the runs.
+        before: (R, T, C) simulated by the base model.
+        after: (R, T, C) simulated by the extended model.
+        sigma: (C,) noise of each channel.
+        mark: Text that is appended to the names of runs.
     """
     parts = _parts(world, after, mark)
     residuals = [(world.observed - simulated) / sigma for simulated in (before, after)]
     shown = []
     for kind, label, mask in parts:
-        # A run or phase without a sample has no RMS.
+        # A run or phase without samples has no RMS.
         if not mask.any():
             continue
         sizes = []
@@ -59,7 +73,7 @@ def places(world: World, before: Array, after: Array, sigma: Array, mark: str = 
 
 
 def _parts(world: World, simulated: Array, mark: str) -> list[tuple[str, str, Mask]]:
-    """Kind, label and (R, T, C) mask of what was observed in each run, channel and phase."""
+    """List the kind, label and observed mask (R, T, C) of each run, channel and phase."""
     seen = np.isfinite(world.observed)
     runs, _, channels = seen.shape
     parts: list[tuple[str, str, Mask]] = []
@@ -70,23 +84,29 @@ def _parts(world: World, simulated: Array, mark: str) -> list[tuple[str, str, Ma
     for c, name in enumerate(world.channels):
         of_channel = np.arange(channels) == c
         parts.append(("channel", name, seen & of_channel))
-    # Told from the simulation: the noise of a measured speed would make phases of its own.
+    # Phases come from the simulation, because noise of a measured speed would cause false ones.
     for phase, where in phases(world, simulated).items():
         parts.append(("phase", phase, seen & where[:, :, None]))
     return parts
 
 
 def phases(world: World, simulated: Array) -> dict[str, Mask]:
-    """(R, T) masks: flight, impact, at rest for what bounces; motion, reversal, at rest for the
-    others; saturated.
+    """Detect phases of the motion as masks (R, T).
+
+    They are flight, impact and at rest for a system that bounces; motion, reversal and at rest for
+    others; and saturated input.
+
+    Args:
+        world: Run evaluator of the runs.
+        simulated: (R, T, C) simulated motion.
     """
     system = world.simulator.system
     speed = speeds(world, simulated)
     if speed is None:
         return {}
-    # Where nothing moves all is at rest, and no share of zero.
+    # The lower limit avoids a division by zero if nothing moves; then all is at rest.
     largest = max(float(np.nanmax(speed)), 1e-300)
-    # A reversal is slow for a moment too: only what lasts is rest.
+    # A reversal is slow for a moment too, so only a lasting state counts as rest.
     still = _lasting(speed < QUIET * largest)
     if system.bounces:
         impact = _impacts(world, simulated) & ~still
@@ -94,7 +114,7 @@ def phases(world: World, simulated: Array) -> dict[str, Mask]:
     else:
         reversal = (speed < SLOW * largest) & ~still
         masks = {"motion": ~reversal & ~still, "reversal": reversal, "at rest": still}
-    # It lies across the others: an input may be at its limit in each of them.
+    # This phase may overlap with the others, because an input can saturate in each of them.
     saturated = _saturated(world)
     if saturated.any():
         masks["saturated input"] = saturated
@@ -102,8 +122,14 @@ def phases(world: World, simulated: Array) -> dict[str, Mask]:
 
 
 def speeds(world: World, simulated: Array) -> Array | None:
-    """(R, T) speed of the simulated motion along the recorded coordinates, 0 behind the end; None
-    without any.
+    """Compute the speed (R, T) of the simulated motion along the recorded coordinates.
+
+    Args:
+        world: Run evaluator of the runs.
+        simulated: (R, T, C) simulated motion.
+
+    Returns:
+        Speed, 0 after the end of a run; None without recorded coordinates.
     """
     squares = np.zeros(simulated.shape[:2])
     shown = [n for n in world.simulator.system.coordinates if n in world.channels]
@@ -111,7 +137,7 @@ def speeds(world: World, simulated: Array) -> Array | None:
         values = simulated[:, :, world.channels.index(name)]
         for r, track in enumerate(world.tracks):
             size = len(track.observed)
-            # One sample has no slope.
+            # A single sample has no slope.
             if size > 1:
                 slope = np.gradient(values[r, :size], track.scenario.times)
                 squares[r, :size] += np.square(slope)
@@ -119,10 +145,10 @@ def speeds(world: World, simulated: Array) -> Array | None:
 
 
 def _lasting(mask: Mask) -> Mask:
-    """Where a mask holds for at least `REST` samples in a row."""
+    """Return where a mask is true for at least `REST` consecutive samples."""
     lasting = np.zeros_like(mask)
     for row, out in zip(mask, lasting, strict=True):
-        # Framed by zeros, changes come in pairs: where a stretch begins, and one behind its end.
+        # With zeros at both ends, changes come in pairs: start and end of each interval.
         framed = np.concatenate([[0], row.astype(np.int8), [0]])
         edges = np.flatnonzero(np.diff(framed))
         for begin, end in zip(edges[::2], edges[1::2], strict=True):
@@ -131,16 +157,16 @@ def _lasting(mask: Mask) -> Mask:
 
 
 def _impacts(world: World, simulated: Array) -> Mask:
-    """Around the lowest points of the flight."""
+    """Return the samples around the lowest points of the flight."""
     name = world.simulator.system.coordinates[-1]
     mask = np.zeros(simulated.shape[:2], dtype=bool)
     if name not in world.channels:
         return mask
     height = simulated[:, :, world.channels.index(name)]
-    # Behind the end of a shorter run heights are NaN, and no lowest point.
+    # After the end of a shorter run heights are NaN, which are never lowest points.
     before, here, behind = height[:, :-2], height[:, 1:-1], height[:, 2:]
     with np.errstate(invalid="ignore"):
-        # Of a level stretch the last sample counts: one impact is not many.
+        # In a flat interval only the last sample counts, so that one impact is not counted twice.
         low = (here <= before) & (here < behind)
     low = np.pad(low, ((0, 0), (1, 1)))
     for shift in range(-NEAR_IMPACT, NEAR_IMPACT + 1):
@@ -149,7 +175,7 @@ def _impacts(world: World, simulated: Array) -> Mask:
 
 
 def _saturated(world: World) -> Mask:
-    """Where the first input stays at its extreme."""
+    """Return where the first input stays at its extreme."""
     mask = np.zeros(world.observed.shape[:2], dtype=bool)
     for r, track in enumerate(world.tracks):
         for signal in list(track.scenario.inputs.values())[:1]:
@@ -157,13 +183,21 @@ def _saturated(world: World) -> Mask:
             largest = max(float(size.max()), 1e-300)
             mask[r, : signal.size] = (size >= EXTREME * largest) & (size > 0)
     lasting = _lasting(mask)
-    # A constant or square input is at its extreme always, which is no saturation.
+    # A constant or square input is always at its extreme, which is not saturation.
     return lasting if lasting.mean() < 0.5 else np.zeros_like(mask)
 
 
 def profiles(world: World, before: Array, after: Array, sigma: Array) -> list[Profile]:
-    """The residual of the channel that the sensor effects act on, against time, position, speed and
-    the inputs; of a robot that of the channel with the largest gap, against its own joint's.
+    """Compute the profiles of the residual against time, position, speed and inputs.
+
+    The channel is the one that sensor effects act on. For a robot it is the one with the largest
+    gap, against the variables of its joint.
+
+    Args:
+        world: Run evaluator of the runs.
+        before: (R, T, C) simulated by the base model.
+        after: (R, T, C) simulated by the extended model.
+        sigma: (C,) noise of each channel.
     """
     name = world.simulator.system.reading(world.channels)
     followed_by = _variables(world, after)
@@ -178,11 +212,11 @@ def profiles(world: World, before: Array, after: Array, sigma: Array) -> list[Pr
         edges = _edges(followed)
         if edges is None:
             continue
-        # What lies beyond the edges counts in the outermost bins.
+        # Values outside the edges count in the outermost bins.
         places = np.searchsorted(edges, followed, side="right") - 1
         bins = np.clip(places, 0, BINS - 1)
         counts = np.bincount(bins, minlength=BINS).astype(np.float64)
-        # An empty bin has no mean: NaN, not drawn.
+        # The mean of an empty bin is NaN and is not drawn.
         with np.errstate(invalid="ignore", divide="ignore"):
             means = []
             for simulated in (before, after):
@@ -196,13 +230,13 @@ def profiles(world: World, before: Array, after: Array, sigma: Array) -> list[Pr
 
 
 def robot_of(world: World) -> Robot | None:
-    """The robot of a recording; None where it is of another system."""
+    """Return the robot of a recording; None for other systems."""
     robot: Robot | None = getattr(world.kind.system, "robot", None)
     return robot
 
 
 def _loudest(world: World, before: Array, sigma: Array) -> str:
-    """The channel with the largest residual in units of its noise."""
+    """Return the channel with the largest residual in units of its noise."""
     squares = np.square((world.observed - before) / sigma)
     sizes = []
     for c in range(len(world.channels)):
@@ -212,7 +246,7 @@ def _loudest(world: World, before: Array, sigma: Array) -> str:
 
 
 def _edges(values: Array) -> Array | None:
-    """(BINS + 1,) edges over most of the values; None where they do not differ."""
+    """Return bin edges (BINS + 1,) over most of the values; None if they are all equal."""
     if not values.size or np.ptp(values) == 0:
         return None
     low, high = (float(v) for v in np.quantile(values, [TAILS, 1.0 - TAILS]))
@@ -221,13 +255,13 @@ def _edges(values: Array) -> Array | None:
 
 
 def _variables(world: World, simulated: Array) -> Iterator[tuple[str, str, Array]]:
-    """Name, unit and (R, T) values of what a residual may follow."""
+    """Yield name, unit and values (R, T) of the variables of the profiles."""
     times = _times(world)
     yield "time", "s", times
     system = world.simulator.system
     units = {channel.name: channel.unit for channel in world.kind.channels}
     primary = system.coordinates[system.primary] if system.coordinates else ""
-    # Simulated: the noise of a measured one is in the residual too, and would follow itself.
+    # The simulated position is used, because the noise of a measured one is part of the residual.
     if primary in world.channels:
         position = simulated[:, :, world.channels.index(primary)]
         yield "position", units[primary], position
@@ -239,7 +273,7 @@ def _variables(world: World, simulated: Array) -> Iterator[tuple[str, str, Array
 
 
 def _times(world: World) -> Array:
-    """(R, T) seconds from the beginning of each run: clocks of runs may stand anywhere."""
+    """Return the time (R, T) in seconds since the start of each run, whatever its clock."""
     times = np.full(world.observed.shape[:2], np.nan)
     for r, track in enumerate(world.tracks):
         times[r, : len(track.observed)] = track.scenario.times - track.scenario.times[0]
@@ -247,7 +281,7 @@ def _times(world: World) -> Array:
 
 
 def _inputs(world: World, names: Collection[str]) -> Iterator[tuple[str, str, Array]]:
-    """Name, unit and (R, T) values of the inputs of these names that were recorded."""
+    """Yield name, unit and values (R, T) of the recorded inputs with these names."""
     for channel in world.kind.inputs:
         values = np.full(world.observed.shape[:2], np.nan)
         for r, track in enumerate(world.tracks):
@@ -261,7 +295,7 @@ def _inputs(world: World, names: Collection[str]) -> Iterator[tuple[str, str, Ar
 def _variables_of_joint(
     world: World, simulated: Array, channel: str
 ) -> Iterator[tuple[str, str, Array]]:
-    """As `_variables`, of the joint of a channel: its velocity has a sign, as friction has."""
+    """Yield the variables of a channel's joint, with signed velocity, which friction needs."""
     times = _times(world)
     yield "time", "s", times
     robot = robot_of(world)

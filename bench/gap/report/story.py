@@ -1,4 +1,4 @@
-"""What an explanation tells: plain data that account, figures and report are made from."""
+"""Report data of an explanation, from which summary, figures and page are made."""
 
 from __future__ import annotations
 
@@ -19,8 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Shown:
-    """One recorded channel: name, unit, noise (1 sigma), whether that is stated, its quantisation
-    (0: none).
+    """Recorded channel.
+
+    Attributes:
+        name: Name of the channel.
+        unit: Unit of its values.
+        sigma: Standard deviation of the noise.
+        stated: Whether the noise is specified in the recording.
+        step: Quantisation step; 0 for none.
     """
 
     name: str
@@ -32,14 +38,14 @@ class Shown:
 
 @dataclass(frozen=True)
 class Side:
-    """Runs with what was measured and simulated.
+    """Runs with measured and simulated data.
 
     Attributes:
-        names: of the runs.
-        times: (T_r,) seconds of each run.
-        observed: (R, T, C), NaN where missing and behind the end of shorter runs.
-        before: (R, T, C) the tuned base model.
-        after: (R, T, C) the extended model; the base model again where nothing was found.
+        names: Names of the runs.
+        times: (T_r,) sample times of each run in seconds.
+        observed: (R, T, C) measurements; NaN where missing and after the end of shorter runs.
+        before: (R, T, C) simulated by the fitted base model.
+        after: (R, T, C) simulated by the extended model; the base model if nothing was found.
     """
 
     names: tuple[str, ...]
@@ -51,15 +57,14 @@ class Side:
 
 @dataclass(frozen=True)
 class Place:
-    """Where the gap is: RMS of the residual in units of the noise, before and after, in one part of
-    the data.
+    """Gap location: RMS residual in units of the noise in one part of the data.
 
     Attributes:
         kind: ``run``, ``channel`` or ``phase``.
-        label: which one.
-        samples: how many.
-        before: RMS, 1 is the noise floor.
-        after: RMS.
+        label: Name of the part.
+        samples: Number of samples.
+        before: RMS residual of the base model; 1 is the noise floor.
+        after: RMS residual of the extended model.
     """
 
     kind: str
@@ -71,15 +76,15 @@ class Place:
 
 @dataclass(frozen=True)
 class Profile:
-    """The residual of one channel against a variable, averaged in bins.
+    """Residual of one channel against a variable, averaged in bins.
 
     Attributes:
-        channel: whose residual.
+        channel: Name of the channel.
         variable: ``time``, ``position``, ``speed`` or an input's name.
-        unit: of the variable.
-        centres: (B,) of the bins.
-        before: (B,) mean residual, units of the channel; NaN in empty bins.
-        after: (B,).
+        unit: Unit of the variable.
+        centres: (B,) centres of the bins.
+        before: (B,) mean residual of the base model, in the channel's unit; NaN in empty bins.
+        after: (B,) mean residual of the extended model.
         error: (B,) standard error of a mean, from the noise.
     """
 
@@ -94,9 +99,17 @@ class Profile:
 
 @dataclass(frozen=True)
 class Tuned:
-    """A parameter before and after the extension, each with its 95 % interval (NaN where the data
-    give none), and which end of its range it lies at, before and after; of a robot also what
-    becomes of the number of its model file.
+    """Change of a parameter by the extension.
+
+    Attributes:
+        name: Name of the parameter.
+        unit: Unit of its value.
+        before: Value in the base model, with the ends of its 95 % interval; NaN without an
+            interval.
+        after: Value in the extended model, with the ends of its 95 % interval.
+        touched: Whether the data are sensitive to it.
+        bounds: End of its range that it is at, before and after; None if it is inside.
+        in_file: For a robot, text on the change of its number in the model file.
     """
 
     name: str
@@ -110,13 +123,13 @@ class Tuned:
 
 @dataclass(frozen=True)
 class Change:
-    """A line of a robot's model file that the extended one has otherwise.
+    """Changed line of a robot's model file.
 
     Attributes:
-        element: whose line, as ``joint elbow``.
-        before: the line as it is; empty where there is none.
-        after: the line as it should be; empty where it goes.
-        comment: which cause, interval and recording ask for it.
+        element: Element of the line, such as ``joint elbow``.
+        before: Line in the file; empty if there is none.
+        after: Line in the extended file; empty if it is removed.
+        comment: Cause, interval and recording that are the reason.
     """
 
     element: str
@@ -127,35 +140,34 @@ class Change:
 
 @dataclass(frozen=True)
 class Story:
-    """Everything that is told.
+    """Report data of an explanation.
 
     Attributes:
-        title: of the recording.
-        path: of the recording.
-        verdict: the answer with its numbers; its ``says`` and names are texts from files or
-            plugins: escape them.
-        channels: the recorded ones.
-        fitting: runs for fitting.
-        held_out: runs for measuring; None where there are none.
-        places: where the gap is, held-out runs included.
-        profiles: the residual against time, position, speed and inputs.
-        parameters: before and after.
-        remains: what the extended model leaves unexplained and what to bear in mind, a sentence
-            each; may be empty.
-        why: sentences that say why the verdict is what it is, the most important first.
-        vague: names of base parameters that the data do not fix.
-        robot: whose recording it is, to be drawn; None for systems that are no robots.
-        changes: of its model file.
-        unwritten: what its model file cannot hold, and what is to be known of it, a sentence each.
-        fixable: what the recording can say of each number and cause; empty where nobody knows.
-        apart: what runs, logs and loads say of the numbers by themselves.
-        track: the picture of a film's track (PNG), of a recording that was tracked; empty for none.
-        logs: recordings that are explained together.
-        thorough: whether all has been searched that can be.
-        cross_validated: whether `held_out` has all runs, each predicted by fits to the others,
-            since they were too few to hold one out.
+        title: Title of the recording.
+        path: Path of the recording.
+        verdict: Verdict with its numbers. Its ``says`` and names come from files or plugins and
+            must be escaped.
+        channels: Recorded channels.
+        fitting: Runs for fitting.
+        held_out: Runs for validation; None if there are none.
+        places: Gap locations, including held-out runs.
+        profiles: Residual against time, position, speed and inputs.
+        parameters: Parameters before and after.
+        remains: Sentences on what the extended model leaves unexplained, and notes; may be empty.
+        why: Reasons for the verdict, one sentence each, the most important first.
+        vague: Names of base parameters that the data do not identify.
+        robot: Recorded robot, to be drawn; None for other systems.
+        changes: Changes of the robot's model file.
+        unwritten: Notes on the model file and on what it cannot express, one sentence each.
+        fixable: Identifiability of each parameter and cause; empty if unknown.
+        apart: Consistency of the parameters between runs, logs and loads.
+        track: Figure of a ball track (PNG) for a recording from a film; empty for none.
+        logs: Number of recordings that are explained together.
+        thorough: Whether the search was thorough.
+        cross_validated: Whether `held_out` contains all runs, each predicted by fits to the others,
+            because there were too few to hold one out.
         share_intervals: 95 % interval of the share of the held-out gap that each effect closes
-            alone, by its name, where that was simulated.
+            alone, by effect, if it was simulated there.
     """
 
     title: str
@@ -183,10 +195,10 @@ class Story:
 
     @property
     def validation_runs(self) -> str:
-        """Name the runs of `held_out` in a sentence."""
+        """Name of the runs of `held_out` in a sentence."""
         return "runs left out in turn" if self.cross_validated else "held-out runs"
 
     @property
     def validation_run(self) -> str:
-        """Return the word that goes before the name of a run of `held_out`."""
+        """Word before the name of a run of `held_out`."""
         return "left-out" if self.cross_validated else "held-out"

@@ -1,11 +1,11 @@
-"""Numbers, units and names as a person reads them, in the account, the figures and the page."""
+"""Text of numbers, units and effect names, for the summary, the figures and the page."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 
-# A page of explain takes all its words from here, those that every page shares too.
+# All text functions of explain's pages are imported from this module, including the shared ones.
 from bench.pages.text import RAISED
 from bench.pages.text import clean as clean
 from bench.pages.text import estimate as estimate
@@ -18,9 +18,9 @@ from sims.base import InputError
 from sims.extended import Number
 
 END = {"low": "lower", "high": "upper"}
-"""What an end of a range is called."""
+"""Words for the ends of a range."""
 FAMILY = "*"
-"""The place of a family: all of one kind."""
+"""Place of a family: all places of one kind."""
 _AT = {
     "joint": ("at", "joints"),
     "actuator": ("at", "actuators"),
@@ -28,34 +28,35 @@ _AT = {
     "channel": ("in", "channels"),
     "level": ("of", "levels"),
 }
-"""How a sentence leads to a place of each kind, and how it calls several."""
+"""Preposition before a place of each kind, and the plural of the kind."""
 NUMERICS = {
     "numerics.step": "too long a time step",
     "numerics.integrator": "an integrator that does not follow the motion",
 }
-"""How a robot is stepped, where that is the cause: no effects, and wrong in the model file."""
+"""Names of a too coarse time step or integrator as causes; they are errors of the model file, not
+effects.
+"""
 _WRONG = re.compile(r"an? (wrong|misplaced) ")
-"""Beginnings of the nouns of what a simulation has wrong, and does not lack."""
+"""Pattern of nouns that name a wrong value, not a missing effect."""
 
 
 def noun(effect: str) -> str:
-    """An effect as a noun, e.g. ``linear drag``; effects joined by + as ``a and b``; unknown ones
-    keep their name.
+    """Format an effect as a noun, such as ``linear drag``.
+
+    Effects joined by + become ``a and b``. Unknown effects keep their name.
     """
     return joined([_noun(part.strip()) for part in effect.split("+")])
 
 
 def _noun(name: str) -> str:
-    """The effect's own noun, with its place; for one without, its name and the first clause of what
-    it says.
-    """
+    """Format one effect as a noun with its place, or by its name and description without a noun."""
     base, place = parted(name)
     if base in NUMERICS:
         return NUMERICS[base]
     try:
         effect = effects.get(base)
     except InputError:
-        # a verdict may name an effect of a plugin that is not loaded here
+        # A verdict may name an effect of a plugin that is not loaded.
         return clean(name, 60)
     if effect.noun:
         what = clean(effect.noun, 60)
@@ -65,15 +66,13 @@ def _noun(name: str) -> str:
 
 
 def parted(effect: str) -> tuple[str, str]:
-    """An effect's registered name and its place, ``*`` of a family; empty where it has none."""
+    """Split an effect into its registered name and its place, which is ``*`` for a family."""
     base, _, place = effect.partition("@")
     return base, place
 
 
 def kind_of(effect: str) -> str:
-    """Of what kind an effect's places are: ``joint``, ``actuator``, ``body``, ``channel``; empty
-    where that is not known.
-    """
+    """Return the kind of an effect's places, such as ``joint`` or ``body``; empty if unknown."""
     try:
         kind: str = getattr(effects.get(parted(effect)[0]), "at", "")
     except InputError:
@@ -82,7 +81,7 @@ def kind_of(effect: str) -> str:
 
 
 def is_wrong(effect: str) -> bool:
-    """Whether it is a number that is wrong, and nothing that is lacking."""
+    """Return whether the effect corrects a wrong value instead of adding a missing effect."""
     base, _ = parted(effect)
     if base in NUMERICS:
         return True
@@ -94,8 +93,13 @@ def is_wrong(effect: str) -> bool:
 
 
 def at(kind: str, places: Sequence[str], last: str = "or", wrong: bool = False) -> str:
-    """`` at joint elbow``, `` at every joint``, `` at any of the joints a, b or c``; `` of joint
-    elbow`` where a number of it is wrong.
+    """Format places: `` at joint elbow``, `` at every joint``, `` at any of the joints a, b or c``.
+
+    Args:
+        kind: Kind of the places.
+        places: Names of the places.
+        last: Conjunction before the last name.
+        wrong: Whether the effect is a wrong value of the place: `` of joint elbow``.
     """
     before, several = _AT.get(kind, ("at", "places"))
     before = "of" if wrong else before
@@ -109,16 +113,16 @@ def at(kind: str, places: Sequence[str], last: str = "or", wrong: bool = False) 
 
 
 def name_of(effect: str) -> str:
-    """An effect's noun without its article, for lists."""
+    """Format an effect as a noun without its article, for lists."""
     return re.sub(r"^an? ", "", noun(effect))
 
 
 def sentence(text: object) -> str:
-    """With a capital at its beginning and a stop at its end."""
+    """Format text as a sentence, with a capital first letter and a final period."""
     plain = clean(text)
     if not plain:
         return plain
-    # A name with digits or underscores stays as it is.
+    # A name with digits or underscores stays unchanged.
     word = plain.split()[0].rstrip(",:;.").isalpha()
     first = plain[0].upper() if word else plain[0]
     stop = "" if plain[-1] in ".!?…" else "."
@@ -126,25 +130,32 @@ def sentence(text: object) -> str:
 
 
 def pretty(unit: str) -> str:
-    """A unit as printed, ``kg·m²``; empty for a pure number."""
+    """Format a unit for print, such as ``kg·m²``; empty for a pure number."""
     power = r"(?:\^|\*\*)(-?\d+)"
     raised = re.sub(power, lambda match: match[1].translate(RAISED), clean(unit, 60))
     return "" if raised == "1" else raised.replace("*", "·")
 
 
 def labelled(name: str, unit: str, most: int = 30) -> str:
-    """``q [rad]``, ``q`` for a pure number."""
+    """Format a label with its unit: ``q [rad]``, or ``q`` for a pure number.
+
+    Args:
+        name: Text of the label.
+        unit: Unit.
+        most: Maximum number of characters of the text.
+    """
     return f"{clean(name, most)} [{pretty(unit)}]" if pretty(unit) else clean(name, most)
 
 
 def with_unit(text: str, unit: str) -> str:
-    """A number and its unit."""
+    """Append a unit to a number."""
     return f"{text} {pretty(unit)}" if pretty(unit) else text
 
 
 def estimated(fitted: Number) -> str:
-    """A fitted number with its interval and its unit, or which bound it lies at; what becomes of
-    the number of the model file; and whether it is outside the usual range.
+    """Format a fitted number with its interval and unit, or the bound that it is at.
+
+    The resulting value in the model file, and a value outside the usual range, are added.
     """
     text = with_unit(estimate(fitted.value, fitted.low, fitted.high), fitted.unit)
     if fitted.at_bound is not None:
@@ -153,7 +164,7 @@ def estimated(fitted: Number) -> str:
 
 
 def in_file(fitted: Number) -> str:
-    """``, in the model file 0.2 → 0.15 N·m``; empty where the file states no such number."""
+    """Format the change in the model file: ``, in the model file 0.2 → 0.15 N·m``; else empty."""
     if fitted.stated is None or fitted.total is None:
         return ""
     total = with_unit(number(fitted.total), fitted.total_unit or fitted.unit)
@@ -161,7 +172,7 @@ def in_file(fitted: Number) -> str:
 
 
 def beyond_usual(fitted: Number) -> str:
-    """``, beyond the usual range of -0.3 to 0.6 N·m·s/rad``; empty for a usual number."""
+    """Format the usual range of a value outside it: ``, beyond the usual range of 0 to 0.6 N``."""
     if fitted.usual_range is None:
         return ""
     low, high = map(number, fitted.usual_range)
@@ -169,5 +180,5 @@ def beyond_usual(fitted: Number) -> str:
 
 
 def at_bound(value: float, unit: str, bound: str) -> str:
-    """``4 s (upper bound of its range)``."""
+    """Format a value at a bound: ``4 s (upper bound of its range)``."""
     return f"{with_unit(number(value), unit)} ({END[bound]} bound of its range)"

@@ -1,1 +1,1 @@
-"""What a rig can be made to do: runs that an experimenter could record, and its limits."""
+"""Candidate experiments: runs that could be recorded, their limits and their value."""

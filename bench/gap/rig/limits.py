@@ -1,8 +1,10 @@
-"""What a rig must not be made to do: leave its joints' ranges, go faster or pull harder than it
-may, touch what it did not touch; by simulation, with all that moves watched, recorded or not.
+"""Limits of an experimental setup: reject runs that exceed limits of position, speed or force.
 
-What a model file states is its limit (`bench.gap.rig.stated_limits`), whatever the runs so far did.
-What nothing states is limited by what the runs so far did themselves.
+Runs are also rejected if bodies touch that did not touch before. The runs are simulated, and all
+moving channels are monitored, whether they are recorded or not.
+
+A limit of the model file (`bench.gap.rig.stated_limits`) holds whatever the present runs did. Where
+the file specifies no limit, it follows from the values in the present runs.
 """
 
 from __future__ import annotations
@@ -22,23 +24,29 @@ from bench.recordings.poses import contacts
 from sims.base import Array, Scenario
 
 TRAVEL = 3.0
-"""Times the range so far that a channel may leave it, where nothing states its limits."""
+"""Distance by which a channel without a specified limit may leave its present range, as a multiple
+of that range.
+"""
 FASTER = 2.0
-"""Times the fastest, and the strongest, so far that a robot may be where nothing states it."""
+"""Maximum speed and force of a robot's joint without a specified limit, as a multiple of the
+present maximum.
+"""
 STOP = 0.01
-"""Share of its range by which a joint may press into its stop, where it did so in the runs so far:
+"""Share of its range by which a joint may press into its stop if it did so in the present runs:
 stops are soft in MuJoCo.
 """
 IDLE = 0.1
-"""Of the fastest, and the strongest, of all joints: what a joint may be that was at rest so far."""
+"""Minimum value used as the present maximum speed and force of a joint that was at rest, as a share
+of the maximum over all joints.
+"""
 
 
 class Limits:
-    """Says which runs a rig can make.
+    """Check of which runs an experimental setup can execute.
 
     Args:
-        world: of the runs so far.
-        model: fitted to them.
+        world: Run evaluator of the present runs.
+        model: Model fitted to them.
     """
 
     def __init__(self, world: World, model: Model) -> None:
@@ -51,18 +59,23 @@ class Limits:
         self.bounds = self._bounds()
 
     def __call__(self, model: Model, runs: Sequence[Run]) -> list[bool]:
-        """Of each run whether it stays within them, were a model true."""
+        """Return for each run whether it stays within the limits if a model is true.
+
+        Args:
+            model: Model with which the runs are simulated.
+            runs: Candidate runs.
+        """
         if not runs:
             return []
         states = np.array([run.states for run in runs])
         seen = self._seen(model, [run.scenario for run in runs], states)
         return [self._within(channels) for channels in seen]
 
-    # -- what is watched
+    # -- monitored channels
 
     @cached_property
     def watched(self) -> list[str]:
-        """Channels that are looked at."""
+        """Names of the monitored channels."""
         kind = self.world.kind
         if not kind.has_model:
             moving = {*kind.system.coordinates, *kind.system.rates, *self.world.channels}
@@ -78,7 +91,7 @@ class Limits:
     def _seen(
         self, model: Model, scenarios: Sequence[Scenario], states: Array
     ) -> list[Mapping[str, Array]]:
-        """What is watched in each of some runs, by name; each to its own end."""
+        """Simulate the monitored channels of each run, by name; each run to its own end."""
         world = self.world
         values = {p.name: float(v) for p, v in zip(world.parameters, model.fit.theta, strict=True)}
         simulator = world.watching(self.watched, model.names)
@@ -97,10 +110,10 @@ class Limits:
             for lane, scenario in zip(result, own, strict=True)
         ]
 
-    # -- what it may
+    # -- limits
 
     def _bounds(self) -> dict[str, tuple[float, float]]:
-        """Lowest and highest of each channel that is watched."""
+        """Determine the minimum and maximum of each monitored channel."""
         ends = {}
         for name in self.watched:
             values = np.concatenate([run[name] for run in self.past])
@@ -135,12 +148,12 @@ class Limits:
 
     @cached_property
     def _touched(self) -> frozenset[tuple[int, int]]:
-        """What touched in the runs so far."""
+        """Pairs of bodies that touched in the present runs."""
         return frozenset().union(*(contacts(self.world.kind, run) for run in self.past))
 
 
 def _with_stop(stated: Interval, past: Interval, is_position: bool) -> Interval:
-    """Stated limits; of a position with what the joint pressed into its stops, a little at most."""
+    """Return the specified limits; a position range is widened a little if stops were pressed."""
     low, high = stated
     if not is_position:
         return stated

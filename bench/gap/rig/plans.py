@@ -1,5 +1,7 @@
-"""Runs that could be recorded next, in the rig's own terms: which command of which form and size,
-about which level, from where, with which load, at which rate.
+"""Candidate runs that could be recorded next, as plans in terms of the experimental setup.
+
+A plan sets the driven inputs, the form, size and offset of the command, the initial state, the
+constants (such as a load) and the sampling rate.
 """
 
 from __future__ import annotations
@@ -15,37 +17,39 @@ from bench.problem.signals import signal
 from sims.base import Array, Scenario
 
 SIZES = (1.0, 2.0, 0.4)
-"""Of the largest command recorded so far."""
+"""Command sizes that are tried, as factors of the largest command recorded."""
 SHARES = (1.0, 1.4, 2.0, -1.0, 0.6, 0.3)
-"""Of where a coordinate began so far, from where it is let go."""
+"""Initial coordinates that are tried, as factors of the recorded initial coordinate."""
 LEVELS = (0.5, -0.5)
-"""Of the largest command, about which a command may go instead of its middle."""
+"""Command offsets that are tried instead of the median, as factors of the largest command."""
 COARSER = (2, 4)
-"""Stamps that are one: a command that is held, or goes straight, for so much longer."""
+"""Factors that are tried for a longer sampling interval; commands are held or interpolated over it.
+"""
 FEWEST = 40
-"""Samples that a run has at least."""
+"""Minimum number of samples of a run."""
 STEADY = 0.05
-"""Rate of a coordinate, in its unit a second, below which a run began at rest."""
+"""Rate of a coordinate, in its unit per second, below which a run began at rest."""
 AT_REST = 0.05
-"""Where a coordinate began, below which it has no share worth a try."""
+"""Minimum magnitude of an initial coordinate to which the factors of `SHARES` apply."""
 PUSHED = 0.2
-"""Share of a run after which what was pushed is let go."""
+"""Share of a run after which a pushed system is released."""
 HELD = 6
-"""Levels of a run of holds."""
+"""Number of levels in a run of holds."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What to do, in words and numbers.
+    """Plan of a run.
 
     Attributes:
-        driven: inputs that are driven; none where it is let go.
-        form: of their command, in words.
-        size: of it, of the largest so far.
-        level: about which it goes, of the largest so far from its middle.
-        states: to begin with, by name, where they differ from the first run's, at rest.
-        constants: by name, which load, length or gain: one of those recorded so far.
-        coarser: stamps so far that are one now.
+        driven: Driven inputs; empty if the system is only released.
+        form: Form of the command in words.
+        size: Size of the command, as a factor of the largest one recorded.
+        level: Offset of the command from its median, as a factor of the largest one recorded.
+        states: Initial states by name, where they differ from the first run's at rest.
+        constants: Constants by name, such as load, length or gain, with values from the recorded
+            runs.
+        coarser: Factor of the sampling interval.
     """
 
     driven: tuple[str, ...] = ()
@@ -59,7 +63,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Run:
-    """A plan with its commands and its initial state."""
+    """Candidate run: a plan with its command signals and its initial state."""
 
     plan: Plan
     says: str
@@ -68,11 +72,11 @@ class Run:
 
 
 class Rig:
-    """What was recorded so far as what can be done again, otherwise.
+    """Experimental setup, from which variants of the recorded runs are made.
 
     Args:
-        world: of the runs so far.
-        seconds: how long the next may last.
+        world: Run evaluator of the recorded runs.
+        seconds: Duration of the next run in seconds.
     """
 
     def __init__(self, world: World, seconds: float) -> None:
@@ -90,7 +94,10 @@ class Rig:
         self.begin = self._begin()
 
     def _begin(self) -> Array:
-        """Where the first run began, at rest (nobody can throw a robot) and within joint ranges."""
+        """Return the initial state of the first run, at rest and within joint ranges.
+
+        A robot cannot be started in motion.
+        """
         states = self.world.tracks[0].guess.copy()
         rates = set(self.world.simulator.system.rates)
         for i, name in enumerate(self.world.states):
@@ -98,13 +105,16 @@ class Rig:
         return states
 
     def _reachable(self, name: str, value: float) -> float:
-        """The value of a state within the joint's range."""
+        """Clip a state to the range of its joint."""
         return float(np.clip(value, *self.limits.positions.get(name, UNLIMITED)))
 
     # -- plans
 
     def basic(self) -> Iterator[Plan]:
-        """Every form and size, one input at a time and all together; and let go from elsewhere."""
+        """Yield plans of every form and size, for each input alone and for all together.
+
+        Plans that only release the system from other initial states are included.
+        """
         for state in self._beginnings():
             yield Plan(states=(state,))
         groups = [(name,) for name in self.driven]
@@ -114,7 +124,7 @@ class Rig:
                     yield Plan(driven, form, size)
 
     def variants(self, plan: Plan) -> Iterator[Plan]:
-        """A plan with one thing changed."""
+        """Yield variants of a plan with one property changed."""
         for name, value in self._beginnings():
             yield replace(plan, states=tuple((dict(plan.states) | {name: value}).items()))
         for name, values in self._knobs().items():
@@ -131,13 +141,13 @@ class Rig:
                 yield replace(plan, coarser=coarser)
 
     def _beginnings(self) -> Iterator[tuple[str, float]]:
-        """Each coordinate farther from rest, and as fast as it began so far."""
+        """Yield larger initial coordinates, and the fastest initial rates recorded."""
         system, world = self.world.simulator.system, self.world
         unseen = {world.states[i] for i in np.flatnonzero(world.known.all(axis=0))}
         for name in system.coordinates:
             base = float(self.begin[world.states.index(name)])
             values = [share * base if abs(base) > AT_REST else share for share in SHARES]
-            # Beyond its range a joint begins at the end of it, which need not be tried twice.
+            # Outside its range a joint begins at the limit, which is tried only once.
             reachable = dict.fromkeys(self._reachable(name, value) for value in values)
             for value in reachable if name not in unseen else ():
                 yield name, value
@@ -149,7 +159,7 @@ class Rig:
                 yield name, value
 
     def _knobs(self) -> dict[str, list[float]]:
-        """Constants that differed between runs, and what they were: these can be had."""
+        """Return the constants that differ between runs, with their values, which are available."""
         values: dict[str, set[float]] = {}
         for run in self.world.runs:
             for name, value in run.constants.items():
@@ -159,7 +169,7 @@ class Rig:
     # -- runs
 
     def run(self, plan: Plan) -> Run:
-        """The commands of a plan."""
+        """Make the command signals and the initial state of a plan."""
         times = np.arange(0.0, self.seconds, self.step * plan.coarser)
         inputs = {
             name: self._limited(name, np.full(times.size, self.rest[name]))
@@ -179,7 +189,7 @@ class Rig:
         return Run(plan, self._says(plan, inputs, limited), scenario, states)
 
     def _limited(self, name: str, values: Array) -> Array:
-        """A command within the limits of its actuator and its joint."""
+        """Clip a command to the limits of its actuator and its joint."""
         return np.asarray(np.clip(values, *self.limits.commands.get(name, UNLIMITED)))
 
     def _says(self, plan: Plan, inputs: Mapping[str, Array], limited: Sequence[str]) -> str:
@@ -216,16 +226,17 @@ FORMS: Mapping[str, str] = {
     "holds": "",
     "a push, then let go": "",
 }
-"""Commands of size one by what they are called; those that are no signal by a function each."""
+"""Signal specifications of unit size, by name of the form; an empty one is computed by `_command`.
+"""
 
 
 def _command(form: str, times: Array, step: float, rng: np.random.Generator) -> Array:
-    """(T,) a command of size one."""
+    """Compute a command (T,) of unit size."""
     share = times / (times[-1] or 1.0)
     if form == "ramps up and down":
         return np.asarray(2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * share)))
     if form == "holds":
-        # Levels that turn, each as far as it can from the one before, so that friction shows.
+        # Levels alternate with a large change each time, so that friction becomes visible.
         levels = np.array([0.0, 1.0, -1.0, 0.5, -0.5, 0.25])
         return levels[np.minimum((share * HELD).astype(np.intp), HELD - 1)]
     if form == "a push, then let go":

@@ -1,8 +1,8 @@
-"""Limits that a robot's model file states: of commands, positions, velocities and forces.
+"""Limits that a robot's model file specifies: of commands, positions, velocities and forces.
 
-An MJCF states joint ranges, force limits of joints (`actuatorfrcrange`), control ranges and force
-ranges of actuators. A URDF states joint ranges, efforts and velocities; MuJoCo does not compile the
-velocities, so they are read from the file (`sims.robot.urdf.speeds`).
+An MJCF specifies joint ranges, force limits of joints (`actuatorfrcrange`), control ranges and
+force ranges of actuators. A URDF specifies joint ranges, efforts and velocities; MuJoCo does not
+compile the velocities, so they are read from the file (`sims.robot.urdf.speeds`).
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ class StatedLimits:
     """Limits of a robot's model file; empty for a system without one.
 
     Attributes:
-        commands: lowest and highest value of each limited input, in its unit. What an actuator of a
-            joint is commanded keeps to its control range and to the limits of the joint: a torque
-            to effort and force range, a set point to the joint's range or velocity.
-        positions: of limited joints, by channel ``q.JOINT``, rad or m.
-        velocities: of limited joints, by channel ``qd.JOINT``, rad/s or m/s.
-        forces: of limited joints, by channel ``tau.JOINT``, N m or N; infinite where the simulation
-            limits the force of every actuator of the joint by itself.
+        commands: Minimum and maximum of each limited input, in its unit. The command of a joint's
+            actuator respects its control range and the limits of the joint: a torque respects
+            effort and force range, a set point the joint's range or velocity.
+        positions: Limits of joints by channel ``q.JOINT``, in rad or m.
+        velocities: Limits of joints by channel ``qd.JOINT``, in rad/s or m/s.
+        forces: Limits of joints by channel ``tau.JOINT``, in N m or N; infinite if the simulation
+            itself limits the force of every actuator of the joint.
     """
 
     commands: Mapping[str, Interval] = field(default_factory=dict)
@@ -50,7 +50,7 @@ class StatedLimits:
 
 
 def stated_limits(world: World) -> StatedLimits:
-    """Read the limits that the model file of the recorded robot states."""
+    """Read the limits in the model file of the recorded robot."""
     if not world.kind.has_model:
         return StatedLimits()
     kind: Any = world.kind
@@ -74,20 +74,21 @@ def stated_limits(world: World) -> StatedLimits:
 
 
 def _command(robot: Any, actuator: Any) -> Interval:
-    """The interval of an actuator's control within all limits."""
+    """Compute the interval of an actuator's control within all limits."""
     own = actuator.range or UNLIMITED
     if actuator.joint is None:
         return own
     joint = robot.joint(actuator.joint)
     gear = float(robot.compiled.actuator_gear[actuator.id, 0])
     if actuator.kind == "motor":
-        # Force of the actuator: gain times control; on the joint: gear times force.
+        # The actuator force is gain times control, and the joint force is gear times actuator
+        # force.
         gain = float(robot.compiled.actuator_gainprm[actuator.id, 0])
         own = _both(own, _divided(actuator.force, gain))
-        # Several motors of a joint may pull at once.
+        # Several motors of a joint may act at the same time.
         motors = [a for a in robot.actuators if a.joint == joint.name and a.kind == "motor"]
         return _both(own, _divided(_effort(robot, joint), gear * gain * len(motors)))
-    # The set point of a servo is the gear times what the joint is to reach.
+    # The set point of a servo is the gear times the desired value at the joint.
     if actuator.kind in ("position", "pid"):
         own = _both(own, _multiplied(joint.range, gear))
     elif actuator.kind == "velocity" and joint.name in robot.speeds:
@@ -97,7 +98,7 @@ def _command(robot: Any, actuator: Any) -> Interval:
 
 
 def _effort(robot: Any, joint: Any) -> Interval:
-    """The interval of what all actuators of a joint may exert on it."""
+    """Return the interval of the total actuator force on a joint."""
     if joint.effort is None:
         return UNLIMITED
     low, high = robot.compiled.jnt_actfrcrange[joint.id].tolist()
@@ -105,13 +106,13 @@ def _effort(robot: Any, joint: Any) -> Interval:
 
 
 def _both(one: Interval, other: Interval) -> Interval:
-    """The intersection of two intervals; the first where they are disjoint."""
+    """Intersect two intervals; return the first if they are disjoint."""
     low, high = max(one[0], other[0]), min(one[1], other[1])
     return (low, high) if low <= high else one
 
 
 def _multiplied(interval: Interval | None, factor: float) -> Interval:
-    """An interval times a factor; unlimited where there is none."""
+    """Multiply an interval by a factor; unlimited without an interval or with a zero factor."""
     if interval is None or not factor:
         return UNLIMITED
     low, high = sorted((interval[0] * factor, interval[1] * factor))

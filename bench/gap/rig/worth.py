@@ -1,22 +1,22 @@
-"""What runs that could be recorded are worth, by simulation.
+"""Value of candidate runs: expected discrimination of models, or information about parameters.
 
-Where two models explain the data so far, a run x is worth what the rival would still leave of it
-after it is fitted again to both, with what the old data know of its numbers, C, and d the
-difference of the two on the run (T-optimality; A. C. Atkinson, V. V. Fedorov, Biometrika 62(1), 57,
-1975, doi:10.1093/biomet/62.1.57),
+If two models explain the present data, the value of a run x is the residual of the competing model
+on that run after it is refitted to both the data and the run. C is the covariance of its parameters
+from the present data, and d is the difference of the two models on the run (T-optimality; A. C.
+Atkinson, V. V. Fedorov, Biometrika 62(1), 57, 1975, doi:10.1093/biomet/62.1.57):
 
     T(x) = min over δ, z of  |d - J δ - B z|^2 + δ' C^-1 δ                                      (1)
 
-whitened by the noise as the data have it, J and B the rival's derivatives by its numbers and by the
-run's initial state, which is free. Nobody knows which of the models is true, so that it counts the
-lesser of the two, either being fitted to what the other says. Where nothing is open but numbers are
-wide, a run is worth what it narrows them by (D-optimality; V. V. Fedorov, Theory of Optimal
-Experiments, 1972),
+All terms are whitened by the noise of the present data. J and B are the derivatives of the
+competing model by its parameters and by the free initial state of the run. Either model may be
+true, so each is fitted to the prediction of the other, and the smaller value counts. If no models
+compete but parameters are uncertain, the value of a run is the decrease of that uncertainty
+(D-optimality; V. V. Fedorov, Theory of Optimal Experiments, 1972),
 
     D(x) = 1/2 log det(I + C J' (I - B B^+) J)                                                  (2)
 
-Twice the log likelihood by which the rival falls behind scatters about T with the variance 4 T, as
-the noise of the run will have it.
+Because of the noise of the run, twice the difference of the log-likelihoods of the two models has
+the mean T and the variance 4 T.
 """
 
 from __future__ import annotations
@@ -35,37 +35,49 @@ from bench.gap.rig.plans import Run
 from sims.base import Array
 
 SPLITS = 25.0
-"""(1) from which a run settles it: in 19 of 20 cases odds of 33 to 1 remain in its noise."""
+"""Minimum discrimination (1) for which a run distinguishes two models: despite its noise, odds of
+at least 33 to 1 result in 19 of 20 cases.
+"""
 ENOUGH = 4.0 * SPLITS
-"""(1) beyond which more of it is worth no more."""
+"""Discrimination (1) above which a run gains no further value."""
 BEST = 12
-"""Runs of a robot of the largest plain difference for which (1) is asked at all."""
+"""Maximum number of runs of a robot for which (1) is computed: those with the largest difference of
+the models before a refit.
+"""
 MANY, FEWER = 12, 4
-"""Fits of (1) in a row, of a system and of a robot, which takes its time."""
+"""Maximum number of exact evaluations of (1) in a row, for a system and for a robot, which is
+slower to simulate.
+"""
 LITTLE = 1e-3
-"""Of a channel's usual size, by which an initial state is moved for a derivative."""
+"""Step of an initial state for a derivative, in units of the state."""
 WILD = 100.0
-"""Times that such a shift may grow on the way."""
+"""Maximum growth factor of such a step during a run, relative to the channel scales."""
 STEPS = 12
-"""Of a fit of a rival to a run that does not exist."""
+"""Maximum number of iterations of a fit of a competing model to a candidate run."""
 STIFFEST = 1e8
-"""Damping (D. W. Marquardt 1963) at which such a fit is at its end."""
+"""Damping (D. W. Marquardt 1963) above which a fit of a competing model to a candidate run stops.
+"""
 
 
 class _Known(NamedTuple):
-    """What the old runs know of a model's numbers, each in units of `spread`: 1 sigma but no more
-    than a tenth of its bounds.
+    """Information of the present runs on a model's parameters.
+
+    Each parameter is in units of `spread`: its standard error, but at most a tenth of its bounds.
     """
 
     model: Model
     spread: Array
     inverse: Array
-    """Of their covariance."""
+    """Inverse of the covariance matrix of the parameters, in units of `spread`."""
 
 
 class _Slopes(NamedTuple):
-    """A run with a model, and its derivatives, all whitened: (n,), (n, q) by numbers, each in units
-    of its spread, (n, s) by its initial state.
+    """Linearisation of a run with a model, whitened.
+
+    Attributes:
+        centre: (n,) prediction.
+        numbers: (n, q) derivatives by the parameters, each in units of its spread.
+        states: (n, s) derivatives by the initial state.
     """
 
     centre: Array
@@ -74,8 +86,13 @@ class _Slopes(NamedTuple):
 
 
 class Worth(NamedTuple):
-    """A run, (1) of each ordered pair of models or (2) alone, what that is worth, and whether it is
-    so in full, or by the first step.
+    """Value of a candidate run.
+
+    Attributes:
+        run: Candidate run.
+        values: (1) of each ordered pair of models, or (2) alone.
+        worth: Value of the run over all pairs.
+        full: Whether (1) is computed exactly, not only to first order.
     """
 
     run: Run
@@ -85,12 +102,12 @@ class Worth(NamedTuple):
 
 
 def by_worth(entry: Worth) -> tuple[float, str]:
-    """A key that puts the best first."""
+    """Return a sort key that puts the best run first."""
     return -entry.worth, entry.run.says
 
 
 class Judge:
-    """Says what runs are worth for some models, the first of which stands."""
+    """Ranker of candidate runs for some models, the first of which is the present diagnosis."""
 
     def __init__(self, models: Models, rivals: Sequence[Model]) -> None:
         self.models, self.world = models, models.world
@@ -106,7 +123,7 @@ class Judge:
     # -- runs
 
     def judged(self, runs: Sequence[Run]) -> list[Worth]:
-        """Those that can be made, the best first, by the first step of (1) or by (2)."""
+        """Return the runs within the limits, the best first, by (1) to first order or by (2)."""
         stands = self.known[0].model
         able = [run for run, may in zip(runs, self.limits(stands, runs), strict=True) if may]
         if self.world.kind.has_model:
@@ -129,20 +146,23 @@ class Judge:
         return Worth(run, values, _worth(values))
 
     def fitted(self, entry: Worth) -> Worth:
-        """With (1) in full: what a run shows of a rival may be far from it."""
+        """Compute (1) exactly, because the competing model may be far from linear on the run."""
         if not self.pairs:
             return entry._replace(full=True)
         values = entry.values.copy()
         for true, rival in self.pairs:
             values[true, rival] = self._told(entry.run, self.known[true], self.known[rival])
-        # Whichever is true, the run has to be one that can be made.
+        # The run must be within the limits, whichever model is true.
         for one in self.known[1:]:
             if not self.limits(one.model, [entry.run])[0]:
                 values[:] = 0.0
         return Worth(entry.run, values, _worth(values), full=True)
 
     def _plainest(self, runs: Sequence[Run]) -> list[Run]:
-        """Runs of a robot of which models differ most before any refit: it takes its time."""
+        """Select the runs of a robot with the largest difference of the models before any refit.
+
+        The exact evaluation of a robot's run is slow.
+        """
         sizes = []
         for run in runs:
             thetas = [one.model.fit.theta for one in self.known]
@@ -157,12 +177,12 @@ class Judge:
     # -- one run
 
     def _simulated(self, run: Run, thetas: Sequence[Array], states: Sequence[Array]) -> Array:
-        """(L, T, C) the run with each parameter vector and state."""
+        """Simulate the run (L, T, C) with each parameter vector and initial state."""
         scenarios = [run.scenario] * len(thetas)
         return self.world.elsewhere(np.array(thetas), scenarios, np.array(states))
 
     def _whitened(self, values: Array) -> Array:
-        """(L, n) observations, or differences of them, in units of the noise."""
+        """Whiten observations, or differences of them, to (L, n)."""
         seen = np.ones((1, *values.shape[1:]), dtype=np.bool_)
         lanes = np.moveaxis(values, 0, -1)[None]
         result: Array = np.moveaxis(whitened(lanes, seen, self.noise)[0], -1, 0)
@@ -171,8 +191,11 @@ class Judge:
     def _slopes(
         self, run: Run, known: _Known, at: Array, states: Array | None = None
     ) -> _Slopes | None:
-        """Derivatives about a parameter vector; None where there are none, or where the run
-        amplifies how it begins: nobody could say later where it went, or why.
+        """Linearise a run at a parameter vector and an initial state.
+
+        Returns:
+            The linearisation; None if the simulation fails, or if the run amplifies differences of
+            the initial state so much that its result could not be interpreted.
         """
         begin = run.states if states is None else states
         free = known.model.fit.free.tolist()
@@ -195,7 +218,7 @@ class Judge:
         return _Slopes(lanes[0], numbers.T, initial.T / LITTLE)
 
     def _told(self, run: Run, true: _Known, rival: _Known) -> float:
-        """(1), fitted by Levenberg and Marquardt."""
+        """Compute (1) by Levenberg-Marquardt."""
         fit = rival.model.fit
         shown = self._simulated(run, [true.model.fit.theta], [run.states])
         aim = self._whitened(shown)[0]
@@ -235,7 +258,7 @@ def _known(models: Models, model: Model) -> _Known:
 
 
 def _worth(values: Array) -> float:
-    """What a run tells of all pairs, more than enough counted once."""
+    """Sum the discrimination over all pairs; each pair counts up to `ENOUGH`."""
     least = np.minimum(values, values.T)
     return float(np.minimum(least[np.triu_indices(len(least), 1)], ENOUGH).sum())
 
@@ -247,14 +270,14 @@ def _left(
     gone: Array | None = None,
     damping: float = 1e-9,
 ) -> tuple[float, Array, Array]:
-    """(1) to first order, and where its least is: steps of numbers, in their spread, and of states.
+    """Compute (1) to first order, and the steps of parameters and states at its minimum.
 
     Args:
-        gap: (n,) what the rival leaves.
-        slopes: of the rival.
-        known: of it.
-        gone: (q,) how far its numbers are from what the old runs say.
-        damping: of the step.
+        gap: (n,) residual of the competing model.
+        slopes: Linearisation of the competing model.
+        known: Information of the present runs on the competing model.
+        gone: (q,) difference of its parameters from their present estimates, in units of spread.
+        damping: Levenberg-Marquardt damping of the step.
     """
     q = len(known.spread)
     gone = np.zeros(q) if gone is None else gone
@@ -270,7 +293,7 @@ def _left(
 
 
 def _narrowed(slopes: _Slopes, known: _Known) -> float:
-    """(2), as a logarithm."""
+    """Compute (2), the logarithm of the decrease of the uncertainty."""
     basis, _ = np.linalg.qr(slopes.states)
     own = slopes.numbers - basis @ (basis.T @ slopes.numbers)
     scaled = np.linalg.pinv(known.inverse, hermitian=True)

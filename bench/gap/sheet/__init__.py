@@ -1,1 +1,1 @@
-"""The data sheet of a joint or actuator: what logs say of it, and what they do not."""
+"""Data sheet of a joint or actuator: identified numbers, and detection limits of absent effects."""

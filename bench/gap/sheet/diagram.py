@@ -1,13 +1,14 @@
-"""The drive and back-drive diagram: by what force a drive at rest moves a load, holds it, or slips.
+"""Drive and back-drive diagram: forces at which a drive at rest moves a load, holds it, or slips.
 
-With U the force of the motor and P that which it works against, both along the joint, dry friction
-holds what pulls less than the limits F of all laws together at rest (M. Duclusaud et al., 2024,
-arXiv:2410.08650, section III), which may grow with U and P, and f is what pulls at rest besides:
+U is the force of the motor, and P is the load that it works against, both along the joint. Dry
+friction holds the joint while the net force is below the total limit F of all friction laws at rest
+(M. Duclusaud et al., 2024, arXiv:2410.08650, section III). F may depend on U and P. f is the sum of
+all other forces at rest:
 
     U - P + f >  F(U, P)    moves forward                                                       (1)
     U - P + f < -F(U, P)    moves back: where P > 0 the load drives the motor                   (2)
 
-and the joint holds between. The laws are those of the registered effects, asked at rest.
+In between, the joint holds. The laws are those of the registered effects, evaluated at rest.
 """
 
 from __future__ import annotations
@@ -25,19 +26,21 @@ from sims.extended import Extended
 from sims.system import Effect, Force, Friction, Hidden, Kind, Moment, System
 
 POINTS = 201
-"""Loads of the diagram."""
+"""Number of loads on the diagram."""
 HALVINGS = 80
-"""Of the interval in which a boundary lies."""
+"""Number of bisection steps for each boundary."""
 FAR = 1e3
-"""Forces are looked for up to so many times the reach of the diagram."""
+"""Range in which boundary forces are searched, as a multiple of the diagram's range."""
 ROUNDING = 1e-12
-"""Share of that which is none."""
+"""Share of the search range below which a force counts as zero."""
 WIDE = 4.0
-"""Without a limit of the drive the diagram reaches so many times the friction without load."""
+"""Range of the diagram for a drive without a force limit, as a multiple of the friction without
+load.
+"""
 
 
 class _Bench(System):
-    """A joint whose drive and load are given."""
+    """Joint at rest with given drive force and load, at which effects are evaluated."""
 
     name = "bench"
     says = "a joint between a drive and a load"
@@ -50,47 +53,46 @@ class _Bench(System):
     sensed = ()
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """Nothing moves."""
+        """Raise an error, because the joint does not move."""
         raise NotImplementedError
 
     def weight(self, moment: Moment) -> Array:
-        """The load pulls back."""
+        """Return the load as a force that acts against the drive."""
         return -self.passive(moment)
 
     def drive(self, moment: Moment) -> Array:
-        """As given."""
+        """Return the given drive force."""
         return moment.inputs["drive"]
 
     def passive(self, moment: Moment) -> Array:
-        """As given."""
+        """Return the given load."""
         return moment.inputs["load"]
 
     def observe(self, x: Array, v: Array, a: Array, constants: Any) -> dict[str, Array]:
-        """Nothing."""
+        """Raise an error, because the joint has no channels."""
         raise NotImplementedError
 
 
 class _Slide(_Bench):
-    """The same of a joint that slides."""
+    """Prismatic joint at rest with given drive force and load."""
 
     kind: ClassVar[Kind] = "linear"
 
 
 @dataclass(frozen=True)
 class Diagram:
-    """The diagram.
+    """Drive and back-drive diagram.
 
     Attributes:
-        unit: of all forces.
-        load: (N,) what the drive works against.
-        forward: (N,) the drive's force above which the joint moves forward; infinite where it locks
-            itself.
-        back: (N,) that below which it moves back.
-        breakaway: the drive's force that moves it without a load.
-        backdrive: the load that moves it without a drive; infinite where none does.
-        laws: names of the effects in it.
-        without: names of those at the joint that have a state of their own, and no law at rest.
-        reach: of the axes.
+        unit: Unit of all forces.
+        load: (N,) loads that the drive works against.
+        forward: (N,) drive forces above which the joint moves forward; infinite if it locks itself.
+        back: (N,) drive forces below which the joint moves back.
+        breakaway: Drive force that moves the joint without a load.
+        backdrive: Load that moves the joint without drive force; infinite if no load does.
+        laws: Names of the effects that are included.
+        reach: Range of the axes.
+        without: Names of effects at the joint that have a hidden state, so no law at rest.
     """
 
     unit: str
@@ -104,7 +106,7 @@ class Diagram:
     without: tuple[str, ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """As TOML, with the laws that it rests on."""
+        """Return the diagram with the names of its laws as TOML data."""
         return {
             "unit": self.unit,
             "laws": list(self.laws),
@@ -117,12 +119,12 @@ class Diagram:
 
 
 def diagram(subject: Subject, extended: Extended, strongest: float | None) -> Diagram:
-    """The diagram of a joint.
+    """Compute the diagram of a joint.
 
     Args:
-        subject: the joint.
-        extended: its model.
-        strongest: force of the drive at its limit; None where it has none.
+        subject: Joint or system.
+        extended: Extended simulator.
+        strongest: Force limit of the drive; None if it has none.
     """
     found = _Joint(subject, extended)
     zero = np.zeros(1)
@@ -154,21 +156,21 @@ def diagram(subject: Subject, extended: Extended, strongest: float | None) -> Di
 
 
 def _root(growing: Callable[[Array], Array], far: float, count: int) -> Array:
-    """(N,) where functions that grow pass zero; infinite where they do not within reach."""
+    """Find zeros (N,) of increasing functions by bisection; infinite outside the range."""
     low, high = np.full(count, -far), np.full(count, far)
     never, always = growing(high) <= 0, growing(low) > 0
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
         above = growing(middle) > 0
         low, high = np.where(above, low, middle), np.where(above, middle, high)
-    # What halving leaves of a zero is rounding.
+    # A zero is only found up to the rounding error of the bisection.
     middle = np.where(np.abs(high) < ROUNDING * far, 0.0, 0.5 * (low + high))
     root: Array = np.where(never, np.inf, np.where(always, -np.inf, middle))
     return root
 
 
 class _Joint:
-    """The laws of a joint, asked at rest."""
+    """Friction and force laws of a joint, evaluated at rest."""
 
     def __init__(self, subject: Subject, extended: Extended) -> None:
         self.system = _Slide() if subject.linear else _Bench()
@@ -180,7 +182,7 @@ class _Joint:
                 by_effect.setdefault(effect, {})[coefficient] = number.value
         for name, values in by_effect.items():
             law = library.get(name.partition("@")[0])
-            # What a drive's own law does is in the force that it gives.
+            # The law of a drive acts before the drive force, which is given here.
             if issubclass(law, Hidden):
                 self.without = (*self.without, law.name)
             elif law.at == "joint" and issubclass(law, Friction | Force):
@@ -191,7 +193,7 @@ class _Joint:
         self.names = tuple(law.name for law, _ in self.laws)
 
     def friction(self, drive: Array, load: Array) -> Array:
-        """(N,) what is held at most."""
+        """Compute the maximum holding force (N,)."""
         moment = self._moment(drive, load)
         limits = [np.full(len(drive), self.stated)]
         for law, c in self.laws:
@@ -201,7 +203,7 @@ class _Joint:
         return held
 
     def pull(self, drive: Array, load: Array) -> Array:
-        """(N,) what pulls besides."""
+        """Compute the sum of the other forces at rest (N,)."""
         moment = self._moment(drive, load)
         forces = [np.zeros(len(drive))]
         for law, c in self.laws:
@@ -217,5 +219,5 @@ class _Joint:
 
 
 def _each(c: Array, drive: Array) -> Array:
-    """(K, N, 1) coefficients (K, 1, 1) for every force."""
+    """Expand coefficients (K, 1, 1) to (K, N, 1), one for each force."""
     return np.broadcast_to(c, (len(c), len(drive), 1))

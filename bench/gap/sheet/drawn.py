@@ -1,4 +1,4 @@
-"""The drive and back-drive diagram as a picture, and the sheet as one page for print."""
+"""Drive and back-drive diagram as a figure, and the data sheet as one printed page."""
 
 from __future__ import annotations
 
@@ -23,37 +23,38 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 A4 = (8.27, 11.69)
-"""Inches."""
+"""Width and height of an A4 page in inches."""
 _MARGIN = 0.06
-"""Of the page, as a share of its width."""
+"""Margin, as a share of the page width."""
 _LINE = 0.0118
-"""Height of a line of the table, as a share of the page."""
+"""Height of a line of the table, as a share of the page height."""
 _SMALL = 0.0083
-"""Height of a line of what is not shown, in letters of `_SMALL_SIZE`, as a share of the page."""
+"""Height of a line of effects not shown, at font size `_SMALL_SIZE`, as a share of the page height.
+"""
 _SMALL_SIZE = 5.6
-"""Size of its letters, in points."""
+"""Font size of the effects not shown, in points."""
 _NAME_LETTERS = 40
-"""Letters of a name in it at most."""
+"""Maximum number of characters of a name in the list of effects not shown."""
 _LETTER = 0.63
-"""Mean width of a letter, as a share of its size."""
+"""Mean width of a character, as a share of the font size."""
 _TABLE_SIZE, _LEAST_SIZE = 7.5, 5.0
-"""Largest and least size of the letters of the table, in points."""
+"""Maximum and minimum font size of the table, in points."""
 _ROOM = 0.36
-"""Height of the diagram at most, as a share of the page."""
+"""Maximum height of the diagram, as a share of the page height."""
 _LETTERS = 110
-"""Letters of a line across the page."""
+"""Maximum number of characters of a line across the page."""
 _STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8,
     "text.usetex": False,
-    # Names come from files: a dollar sign in one is a dollar sign.
+    # Names come from files, where a dollar sign must not start mathematics.
     "text.parse_math": False,
     "pdf.fonttype": 42,
 }
 
 
 def picture(diagram: Diagram) -> tuple[bytes, bytes | None]:
-    """Render the diagram as SVG for the page, and as PDF where one is asked for."""
+    """Render the diagram as SVG for the page, and as PDF if requested."""
     with _styled():
         figure, axes = style.blank(1, 1, (5.4, 4.6))
         draw(axes[0, 0], diagram)
@@ -61,7 +62,12 @@ def picture(diagram: Diagram) -> tuple[bytes, bytes | None]:
 
 
 def draw(axes: Axes, diagram: Diagram) -> None:
-    """The diagram on axes: by load and motor force, where the joint moves, holds and slips."""
+    """Draw the diagram: where the joint moves, holds and slips, by load and motor force.
+
+    Args:
+        axes: Axes to draw on.
+        diagram: Diagram to draw.
+    """
     reach, unit = diagram.reach, pretty(diagram.unit)
     load = diagram.load
     ahead, back = (np.clip(side, -2 * reach, 2 * reach) for side in (diagram.forward, diagram.back))
@@ -98,13 +104,13 @@ def draw(axes: Axes, diagram: Diagram) -> None:
 
 
 def printed(facts: Facts) -> bytes:
-    """The sheet as a PDF of one page."""
+    """Render the sheet as a PDF of one page."""
     with _styled():
         return style.pdf(paper(facts))
 
 
 def paper(facts: Facts) -> Figure:
-    """The page."""
+    """Draw the sheet as a figure of one page."""
     from bench.figures.picture import Picture
 
     figure = Picture(figsize=A4, layout=None)
@@ -114,7 +120,7 @@ def paper(facts: Facts) -> Figure:
     if diagram is None:
         said = "\n".join(textwrap.wrap(facts.without_drive(), _LETTERS))
         figure.text(_MARGIN, top - 0.01, said, va="top", linespacing=1.4)
-        # The room of the diagram belongs to the table: its letters are larger.
+        # Without a diagram there is space for a table with a larger font.
         _not_shown(figure, facts, size=_SMALL_SIZE + 1.4, begins=top - 0.09)
         return figure
     below = _not_shown(figure, facts, size=_SMALL_SIZE)
@@ -127,7 +133,7 @@ def paper(facts: Facts) -> Figure:
 
 
 def _heading(figure: Figure, facts: Facts) -> float:
-    """Name, title and verdict; what is left below, as a share of the height."""
+    """Draw name, title and verdict; return the height of the space below, as a share."""
     figure.text(_MARGIN, 0.965, clean(facts.name, 60), fontsize=17, weight="bold", va="top")
     title = facts.recording.title or facts.recording.path.stem
     said = f"Data sheet from {clean(title, 90)}. {sentence(facts.verdict.says)}"
@@ -137,7 +143,7 @@ def _heading(figure: Figure, facts: Facts) -> float:
 
 
 def _shown(figure: Figure, facts: Facts, top: float) -> float:
-    """The table of what is shown; what is left below."""
+    """Draw the table of identified numbers; return the height of the space below, as a share."""
     heads = ("", "quantity", "value (95 %)", "another run", "evidence")
     rows = [
         (
@@ -163,7 +169,7 @@ def _shown(figure: Figure, facts: Facts, top: float) -> float:
 
 
 def _columns(rows: Sequence[Sequence[str]]) -> tuple[float, list[float]]:
-    """The size of the letters of a table, and where its columns begin, as shares of the width."""
+    """Choose the font size of a table, and the left edges of its columns as shares of the width."""
     size = _TABLE_SIZE
     while True:
         widths = [text_width(column, size, "bold") for column in zip(*rows, strict=True)]
@@ -176,19 +182,22 @@ def _columns(rows: Sequence[Sequence[str]]) -> tuple[float, list[float]]:
 
 
 def _not_shown(figure: Figure, facts: Facts, size: float, begins: float = 0.0) -> float:
-    """Two columns of what is not shown; where they begin.
+    """Draw the effects that are not shown in two columns.
 
     Args:
-        figure: the page.
-        facts: what is on it.
-        size: of the letters, in points.
-        begins: height of the first line, as a share of the page; 0 for a table that ends at the
-            foot.
+        figure: Page to draw on.
+        facts: Content of the data sheet.
+        size: Font size in points.
+        begins: Height of the first line, as a share of the page; 0 for a table that ends at the
+            foot of the page.
+
+    Returns:
+        Height of the top of the table, as a share of the page.
     """
     rows = []
     names = [short(row) for row in facts.rows if row.number is None]
     longest = min(max(map(len, names), default=0), _NAME_LETTERS)
-    # Letters of a monospaced font are 0.602 of their size wide.
+    # A character of the monospaced font is 0.602 of its size wide.
     beside_name = (0.602 * size / POINTS * longest + 0.12) / A4[0]
     letters = int((0.45 - beside_name) * A4[0] * POINTS / (_LETTER * size))
     for row in facts.rows:
@@ -201,7 +210,7 @@ def _not_shown(figure: Figure, facts: Facts, size: float, begins: float = 0.0) -
     heights = [len(lines) for _, lines in rows]
     half = next((i for i in range(len(rows) + 1) if 2 * sum(heights[:i]) >= sum(heights)), 0)
     tallest = line * max(sum(heights[:half]), sum(heights[half:]))
-    # A long table may not run over the foot.
+    # A long table must not overlap the foot of the page.
     begins = max(begins, 0.045 + tallest)
     for column, part in enumerate((rows[:half], rows[half:])):
         x, y = _MARGIN + 0.45 * column, begins
@@ -218,7 +227,7 @@ def _not_shown(figure: Figure, facts: Facts, size: float, begins: float = 0.0) -
 
 
 def _beside(figure: Figure, diagram: Diagram, x: float, y: float) -> None:
-    """What the diagram says, in words."""
+    """Draw the description of the diagram next to it."""
     unit = diagram.unit
     lines = [f"starts without a load at {with_unit(number(diagram.breakaway), unit)}"]
     load = with_unit(number(diagram.backdrive), unit)
@@ -237,6 +246,6 @@ def _styled() -> Iterator[None]:
     from matplotlib import rc_context
 
     with rc_context(_STYLE), warnings.catch_warnings():
-        # A title may be in any script; what the font lacks is drawn as a box.
+        # A title may be in any script; characters that the font lacks are drawn as boxes.
         warnings.filterwarnings("ignore", message="Glyph")
         yield

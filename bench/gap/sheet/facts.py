@@ -1,4 +1,4 @@
-"""What stands on a data sheet, whatever it is written as."""
+"""Content of a data sheet, for any output format."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sims.extended import Extended
 from sims.recording.recording import Recording
 
 FORMAT = 1
-"""Of sheet.toml."""
+"""Format version of sheet.toml."""
 
 NAMES_IN_TERMINAL = 5
 """Maximum number of effects that the terminal names as not shown by the data."""
@@ -24,15 +24,15 @@ NAMES_IN_TERMINAL = 5
 
 @dataclass(frozen=True)
 class Facts:
-    """What stands on a data sheet.
+    """Content of a data sheet.
 
     Attributes:
-        name: of what it is.
-        subject: the joint, or the system.
-        recording: the logs.
-        verdict: of the explanation.
-        extended: the model that was found.
-        rows: its numbers.
+        name: Name on the sheet.
+        subject: Joint or system that it describes.
+        recording: Logs.
+        verdict: Verdict of the diagnosis.
+        extended: Extended simulator.
+        rows: Numbers of the sheet.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Facts:
     rows: tuple[Quantity, ...]
 
     def document(self) -> dict[str, Any]:
-        """The content of sheet.toml."""
+        """Return the content of sheet.toml."""
         named = {row.name: row.document() for row in self.rows}
         joint = {"joint": self.subject.joint} if self.subject.joint else {}
         return {
@@ -60,7 +60,7 @@ class Facts:
         }
 
     def _at_rest(self) -> dict[str, Any]:
-        """The diagram of a drive; without one, the dry friction that holds the joint."""
+        """Return the diagram of a drive; without a drive, the dry friction that holds the joint."""
         if self.diagram is not None:
             return {"diagram": self.diagram.document()}
         rest = self.rest
@@ -68,16 +68,16 @@ class Facts:
 
     @cached_property
     def is_driven(self) -> bool:
-        """Whether a drive acts here: without one there is nothing to say of it."""
+        """Return whether a drive acts here; without one there is no diagram."""
         return self.subject.is_driven(self.recording)
 
     @property
     def diagram(self) -> Diagram | None:
-        """Where the joint moves, holds and slips, by the force of its drive; None without one."""
+        """Diagram of where the joint moves, holds and slips; None without a drive."""
         return self.rest if self.is_driven else None
 
     def without_drive(self) -> str:
-        """Say why there is no diagram, and what is known of the joint at rest instead."""
+        """Return why there is no diagram, and what is known of the joint at rest instead."""
         why = "the log has no input"
         if self.subject.joint:
             why = (
@@ -96,18 +96,18 @@ class Facts:
 
     @cached_property
     def rest(self) -> Diagram:
-        """Where the joint moves, holds and slips, by the forces that act on it at rest."""
+        """Diagram of where the joint moves, holds and slips, also without a drive."""
         strongest = [row.number.value for row in self.rows if row.strongest and row.number]
         return diagram(self.subject, self.extended, next(iter(strongest), None))
 
     def elsewhere(self) -> Iterator[str]:
-        """Causes that the model has at other places, or in the world."""
+        """Yield causes of the model that act at other places, or in the world."""
         for name, numbers in self.extended.effects.items():
             if not any(True for _ in self.subject.own(name, numbers)):
                 yield name
 
     def lines(self) -> list[str]:
-        """What the sheet says, in words: numbers first, then how many are not shown."""
+        """Format the sheet as text: numbers first, then the effects that are not shown."""
         lines = [f"{clean(self.name, 80)}: {self.verdict.verdict}"]
         shown = [row for row in self.rows if row.number is not None]
         lines += [f"  {clean(r.name, 60)} = {estimated(r.number)}" for r in shown if r.number]

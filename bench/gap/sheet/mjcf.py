@@ -1,8 +1,8 @@
-"""A data sheet as a default class of MJCF, and a model that uses it to score it by.
+"""Data sheet as an MJCF default class, and a model that uses it and can be scored.
 
-What MuJoCo cannot say is said in comments. Of a system, whose moments are known at every sample,
-dry friction that MuJoCo lacks a law for is stated as its mean over the runs, so that the class is
-the nearest that MJCF has.
+Comments state what MuJoCo cannot express. For a system, whose state is known at every sample, a dry
+friction law that MuJoCo lacks is replaced by its mean over the runs, which is the best
+approximation in MJCF.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from sims.system import Friction, ModelFile, Moment
 from sims.user_toml import read_toml
 
 CLASS = "class.xml"
-"""The file of the classes."""
+"""File name of the classes."""
 DRIVEN = 0.5
-"""A motor is on where what switches it is above this."""
+"""Value of a switching input above which the motor is on."""
 
 
 class Made(NamedTuple):
-    """The files by name, and what they cannot say."""
+    """MJCF files by name, and notes on what they cannot express."""
 
     contents: Mapping[str, str]
     said: tuple[str, ...]
 
 
 class _Class(NamedTuple):
-    """A class, what it cannot say, and the model that uses it; empty where none does."""
+    """Default class, notes on what it cannot express, and a model that uses it, if there is one."""
 
     text: str
     said: Sequence[str]
@@ -49,11 +49,11 @@ class _Class(NamedTuple):
 
 
 def mjcf(facts: Facts, folder: Path) -> Made:
-    """The class and the models that use it.
+    """Build the class and the models that use it.
 
     Args:
-        facts: what is on the sheet.
-        folder: where the files will lie: from there the log is named.
+        facts: Content of the data sheet.
+        folder: Folder of the files; the path of the log is relative to it.
     """
     from sims.robot.quiet import quiet
 
@@ -75,7 +75,7 @@ def _of_robot(facts: Facts) -> Made:
 
 
 def _of_system(facts: Facts, folder: Path) -> Made:
-    """A class, a model and a description of the log for each setting of the recording."""
+    """Build a class, a model and a log description for each group of runs with equal constants."""
     from sims.robot.reading import read
 
     made: list[_Class] = []
@@ -104,7 +104,7 @@ def _model_file(facts: Facts, setting: Setting) -> ModelFile | None:
     try:
         return facts.subject.kind.system.model_file(setting.numbers)
     except ZeroDivisionError:
-        # A number that somebody has written into the file.
+        # The file may contain a value that was edited by hand.
         return None
 
 
@@ -117,7 +117,7 @@ def _class(
     facts: Facts,
     notes: Sequence[str] = (),
 ) -> _Class:
-    """The class of a robot's joint."""
+    """Build the class of a robot's joint."""
     from sims.robot.changes import apply
     from sims.robot.defaults import default_class, using
     from sims.robot.markup import UnfitError
@@ -133,13 +133,13 @@ def _class(
 
 
 def class_name(name: str) -> str:
-    """A name of a class that XML and MuJoCo take."""
+    """Convert a name to one that is valid as a class name in XML and MuJoCo."""
     plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_")
     return plain or "drive"
 
 
 def _file(facts: Facts, made: Sequence[_Class]) -> str:
-    """The classes as a file that MuJoCo loads, and that others include."""
+    """Format the classes as a file that MuJoCo loads and that others can include."""
     title = facts.recording.title or facts.recording.path.stem
     heading = f"{class_name(facts.name)}: data sheet from {title}; written by simgap datasheet"
     safe = re.sub(r"-(?=-)", "- ", heading)
@@ -149,12 +149,12 @@ def _file(facts: Facts, made: Sequence[_Class]) -> str:
 
 @dataclass(frozen=True)
 class Setting:
-    """Runs of a recording that share their constants.
+    """Runs of a recording with equal constants.
 
     Attributes:
-        name: short, of the constants that differ; empty where none does.
-        numbers: parameters and constants.
-        runs: of the recording.
+        name: Short name from the constants; empty if there are none.
+        numbers: Parameters and constants.
+        runs: Runs of the recording.
     """
 
     name: str
@@ -163,7 +163,7 @@ class Setting:
 
 
 def settings(facts: Facts) -> list[Setting]:
-    """The runs by the constants that differ between them, in the order of the recording."""
+    """Group the runs by their constants, in the order of the recording."""
     by_constants: dict[tuple[tuple[str, float], ...], list[Run]] = {}
     for run in facts.recording.runs:
         by_constants.setdefault(tuple(sorted(run.constants.items())), []).append(run)
@@ -184,7 +184,7 @@ def settings(facts: Facts) -> list[Setting]:
 def _placed(
     facts: Facts, setting: Setting, model: ModelFile
 ) -> tuple[dict[str, Mapping[str, Number]], list[str]]:
-    """What was found, at its places in the model file; and what stands for what."""
+    """Map the fitted effects to their places in the model file, with notes on approximations."""
     from sims.robot.native import FIELDS
 
     places = {"joint": model.joint, "actuator": model.actuator, "channel": model.signals["q"]}
@@ -215,7 +215,7 @@ def _placed(
 def _held(
     facts: Facts, setting: Setting, effect: type[Friction], numbers: Mapping[str, Number]
 ) -> float:
-    """The mean limit of a friction over the samples of some runs."""
+    """Compute the mean limit of a friction law over the samples of some runs."""
     limits = [_limits(facts, setting, run, effect, numbers) for run in setting.runs]
     seen = np.concatenate(limits)
     return float(seen[np.isfinite(seen)].mean())
@@ -228,7 +228,7 @@ def _limits(
     effect: type[Friction],
     numbers: Mapping[str, Number],
 ) -> Array:
-    """(T,) the limit of a friction at each sample of a run: its samples are lanes."""
+    """Compute the limit (T,) of a friction law at each sample of a run, as one batch."""
     kind = facts.subject.kind
     system = kind.system()
     (coordinate,) = system.coordinates
@@ -255,8 +255,9 @@ def _limits(
 def _described(
     facts: Facts, setting: Setting, model: ModelFile, stem: str, folder: Path
 ) -> Iterator[tuple[str, str]]:
-    """A description of the log for the model, where its runs are marked held out; nothing where the
-    log is of several files.
+    """Yield a description of the log for the model, in which its runs are marked held out.
+
+    Nothing is yielded for a log of several files.
     """
     import tomli_w
 
@@ -280,6 +281,6 @@ def _described(
 
 
 def _driven(run: Run, model: ModelFile) -> bool:
-    """Whether what switches the motor is on all the time."""
+    """Return whether the inputs that switch the motor are on all the time."""
     switches = [values for name, values in run.inputs.items() if name not in model.signals]
     return all(bool((values > DRIVEN).all()) for values in switches)

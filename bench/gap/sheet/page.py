@@ -1,4 +1,4 @@
-"""The page of a data sheet: one file without a network, readable without scripts, in print too."""
+"""HTML page of a data sheet: one file that needs no network and no scripts, also for print."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 DIAGRAM = "diagram"
 """Name of the figure, and of the table with its numbers."""
 HEADS = ("", "quantity", "-value (95 %)", "-in another run", "-the file says", "evidence")
-"""Of the table of what is shown."""
+"""Headings of the table of identified numbers."""
 _REACH = (
     "How small a number these data would have shown: within the 95 % interval given it would not "
     "stand out beside the others, the noise being what the model leaves. What says 'not named' "
@@ -40,9 +40,12 @@ _REACH = (
 
 
 def page(sheet: Facts, drawn: tuple[bytes, bytes | None] | None, made: Made) -> str:
-    """Render the page as HTML, with the diagram as SVG and, where one is asked for, PDF.
+    """Render the page as HTML.
 
-    `drawn` is None where there is no drive.
+    Args:
+        sheet: Content of the data sheet.
+        drawn: Diagram as SVG, and as PDF if requested; None without a drive.
+        made: MJCF files with their notes.
     """
     built = Page(f"Data sheet: {clean(sheet.name, 80)}", _foot(sheet))
     if sheet.diagram is not None:
@@ -60,7 +63,7 @@ def page(sheet: Facts, drawn: tuple[bytes, bytes | None] | None, made: Made) -> 
 
 
 def _numbers(diagram: Diagram) -> pd.DataFrame:
-    """The curves of the diagram."""
+    """Build the table of the curves of the diagram."""
     import pandas as pd
 
     columns = {"load": diagram.load, "moves_forward": diagram.forward, "moves_back": diagram.back}
@@ -133,7 +136,7 @@ def _stated(row: Quantity) -> str:
 
 
 def _class(made: Made) -> Iterator[str]:
-    """The class, and what MJCF cannot say."""
+    """Yield the MJCF class and notes on what MJCF cannot express."""
     if CLASS in made.contents:
         said = f"{code(CLASS)} holds it as a default class: include the file, and give the joint "
         yield paragraph(said + "and its actuator the class.")

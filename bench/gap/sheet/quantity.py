@@ -1,4 +1,4 @@
-"""The rows of a data sheet: each number of a joint or actuator, found, fitted or not shown."""
+"""Rows of a data sheet: numbers of a joint or actuator that are found, fitted or not shown."""
 
 from __future__ import annotations
 
@@ -19,28 +19,29 @@ from sims.system import FAMILY
 
 State = Literal["found", "fitted", "derived", "not shown"]
 STEP = 1e-6
-"""Share of a number by which it is moved to see what follows from it."""
+"""Relative step of a parameter for the derivatives of derived quantities."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """One number of the sheet.
+    """Row of the sheet: one number.
 
     Attributes:
-        name: of an effect here, with its coefficient where it has several; of a parameter.
-        says: what it is, in words.
-        part: ``joint``, ``actuator``, ``channel``, or ``system`` for a parameter of one.
-        state: whether it is a cause that was found, a parameter that was fitted, follows from
-            others, or is not shown.
-        number: with its 95 % interval; None where it is not shown.
-        stated: what the model file says of it; None where it says nothing.
-        reach: how small a one these data would have shown, or could not: of what is not shown.
-        p_value: chance of a gain like that of the cause if it were not there.
-        share: of the gap on held-out runs that the cause closes alone; None if not measured.
-        instead: effects that would explain the same share as well.
-        another: half its 95 % interval in a log, or a run, not yet recorded; None where that is not
-            known.
-        strongest: whether it is the force of the drive at its limit, at rest.
+        name: Name of the effect here, with its coefficient if it has several; or of the parameter.
+        says: Name in words.
+        part: ``joint``, ``actuator``, ``channel``, or ``system`` for a parameter of a system.
+        state: ``found`` for a cause, ``fitted`` for a parameter, ``derived`` for a number that
+            follows from others, or ``not shown``.
+        unit: Unit of the number.
+        number: Value with its 95 % interval; None if it is not shown.
+        stated: Value in the model file; None if the file has none.
+        reach: Detection limit of an effect that is not shown.
+        p_value: Probability of a gain like that of the cause if it were absent.
+        share: Share of the held-out gap that the cause closes alone; None if not measured.
+        instead: Effects that explain the data as well.
+        another: Half the 95 % interval for a log, or a run, that is not yet recorded; None if
+            unknown.
+        strongest: Whether it is the force limit of the drive, at rest.
     """
 
     name: str
@@ -58,7 +59,7 @@ class Quantity:
     strongest: bool = False
 
     def document(self) -> dict[str, Any]:
-        """As TOML, which has no null."""
+        """Return the row as TOML data, which has no null."""
         row: dict[str, Any] = {"state": self.state, "says": self.says, "unit": self.unit}
         row["part"] = self.part
         if self.number is not None:
@@ -96,7 +97,17 @@ def _reached(reach: Reach) -> dict[str, Any]:
 def quantities(
     subject: Subject, extended: Extended, verdict: Verdict, shown: Shown
 ) -> tuple[Quantity, ...]:
-    """The rows of a sheet: what follows from parameters, these, causes, then what is not shown."""
+    """Build the rows of a sheet.
+
+    Args:
+        subject: Joint or system.
+        extended: Extended simulator.
+        verdict: Verdict with the evidence.
+        shown: Covariance and detection limits.
+
+    Returns:
+        Derived quantities, parameters, causes, then effects that are not shown.
+    """
     rows = _Rows(subject, extended, verdict, shown)
     return (*rows.derived(), *rows.parameters(), *rows.causes(), *rows.absent())
 
@@ -109,7 +120,7 @@ class _Rows:
     shown: Shown
 
     def derived(self) -> Iterator[Quantity]:
-        """What follows from the system's parameters, by error propagation."""
+        """Yield quantities derived from the system's parameters, by error propagation."""
         parameters = self.extended.parameters
         values = {name: number.value for name, number in parameters.items()}
         known = {**self.extended.constants, **values}
@@ -120,7 +131,7 @@ class _Rows:
             try:
                 value = derived.of(known)
             except (KeyError, ZeroDivisionError):
-                # A constant that differs between runs has no one value.
+                # A constant that differs between runs has no single value.
                 continue
             slopes = []
             for name in free:
@@ -133,18 +144,18 @@ class _Rows:
             yield replace(row, strongest=derived.strongest)
 
     def parameters(self) -> Iterator[Quantity]:
-        """Parameters of the system, or free numbers of the robot's file here."""
+        """Yield the parameters of the system, or the free numbers of the robot's file here."""
         if not self.subject.joint:
             for parameter in self.subject.kind.parameters:
                 nominal = Number(parameter.nominal, parameter.unit, None, None)
-                # What the file does not state is nominal.
+                # A parameter that is not in the file has its nominal value.
                 number = self.extended.parameters.get(parameter.name, nominal)
                 says = parameter.says or parameter.name
                 row = _row(parameter.name, says, "system", "fitted", number, None)
                 yield replace(row, another=self.shown.another.get(parameter.name))
             return
         for name, number in self.extended.parameters.items():
-            # An effect's coefficient, with its name behind a point where it has several.
+            # The coefficient of an effect with several has its name after a point.
             effect, _, place = name.partition("@")
             there = next(
                 (p for p in self.subject.places if place in (p, f"{p}.{_tail(place)}")), ""
@@ -154,12 +165,13 @@ class _Rows:
                 yield self._apart(row, f"{effect}@{there}", name)
 
     def causes(self) -> Iterator[Quantity]:
-        """What was found, and of a family also what is nothing here."""
+        """Yield the diagnosed causes; members of a family that may be zero here are not shown."""
         for name, numbers in self.extended.effects.items():
             own = list(self.subject.own(name, numbers))
             for effect, coefficient, number in own:
                 if number.value == 0:
-                    # As good as not there: it is asked about like any other.
+                    # A coefficient of zero means that the effect is absent; its detection limit is
+                    # computed.
                     continue
                 several = sum(other == effect for other, _, _ in own) > 1
                 label = f"{effect} {coefficient}" if several else effect
@@ -172,21 +184,21 @@ class _Rows:
                 yield self._apart(row, effect, alone)
 
     def _apart(self, row: Quantity, effect: str, parameter: str) -> Quantity:
-        """With what runs say of it by themselves."""
+        """Add the prediction interval from the consistency of the runs."""
         half, stated = self.shown.another.get(parameter), self.subject.stated(effect)
         if half is None or stated is None:
             return replace(row, another=half)
         return replace(row, another=stated.half(half))
 
     def _nothing(self, row: Quantity, effect: str, number: Number) -> Quantity:
-        """A number of a cause that stands elsewhere, and is not shown here."""
+        """Build the row of a cause at other places that is not shown here."""
         reach = _of_number(number, self.subject.stated(effect))
         return Quantity(
             row.name, row.says, row.part, "not shown", row.unit, stated=row.stated, reach=reach
         )
 
     def absent(self) -> Iterator[Quantity]:
-        """What the model has not."""
+        """Yield the effects that are not in the model, with their detection limits."""
         for (effect, coefficient), reach in self.shown.reaches.items():
             several = len({c for e, c in self.shown.reaches if e == effect}) > 1
             label = f"{effect} {coefficient}" if several else effect
@@ -236,7 +248,7 @@ def _tail(place: str) -> str:
 
 
 def _is_nothing(number: Number) -> bool:
-    """Whether a coefficient of a cause that stands elsewhere may be zero here."""
+    """Return whether the coefficient of a cause at other places may be zero here."""
     if number.low is None or number.high is None:
         return False
     return number.low <= 0 <= number.high

@@ -1,22 +1,22 @@
-"""What logs would have shown: about a model that was fitted, how large each number that is not in
-it would have to be to stand out.
+"""Detection limits: how large each absent effect would have to be for the data to reveal it.
 
-With A the whitened derivatives by the numbers that the model has, d those by one more, both
-without what the initial states of each run absorb (`bench.gap.measure`), what is left of d beside
-the others is
+The limits are computed at a fitted model. A are the whitened derivatives by the parameters of the
+model, and d the derivatives by one more coefficient; the initial states of each run are projected
+out of both (`bench.gap.measure`). The remaining information on the coefficient, after A is
+projected out too, is
 
     power = d'd - d'A (A'A)^-1 A'd                                                              (1)
 
-and its 95 % interval reaches 1.96 / sqrt(power) to either side (E. Walter, L. Pronzato,
-Identification of Parametric Models from Experimental Data, 1997, chapter 4). One step of Gauss and
-Newton from zero, by what the model leaves, e, would take it to
+Its 95 % interval extends 1.96 / sqrt(power) to both sides (E. Walter, L. Pronzato, Identification
+of Parametric Models from Experimental Data, 1997, chapter 4). With the residual e of the model, one
+Gauss-Newton step from zero would give the coefficient the value
 
     c = (d'e - d'A (A'A)^-1 A'e) / power                                                        (2)
 
-The noise is what the model leaves, with its memory: where structure is left, it is larger than that
-of the sensor, and (2) may be far from zero without being a cause.
-A limit or a gap is no matter of proportion: it shows at the sizes at which it changes the runs by
-as much as can just be told to be there (`bench.gap.identify`).
+The noise is the residual of the model with its autocorrelation (AR(1)). With a lack of fit it is
+larger than the sensor noise, and (2) may be far from zero although the effect is not a cause.
+The effect of a limit or backlash is not proportional to its size. It is detectable at the sizes at
+which it changes the runs by at least the smallest detectable amount (`bench.gap.identify`).
 """
 
 from __future__ import annotations
@@ -44,27 +44,29 @@ from sims.base import Array, InputError
 from sims.extended import Extended
 
 ALIKE = 0.999
-"""Correlation from which a coefficient of a richer effect is one of a simpler one."""
+"""Minimum correlation for which the coefficient of an effect counts as equivalent to that of a
+simpler effect.
+"""
 
 
 HALVED = 5
-"""How often the smallest gap that a search tries is halved."""
+"""Number of times that the smallest backlash of the search is halved."""
 PART = 0.1
-"""Share of the largest part from which a number is one of those that do the same together."""
+"""Minimum share of the largest contribution for a parameter to be reported as confounded."""
 
 
 @dataclass(frozen=True)
 class Reach:
-    """How small a number these data would have shown.
+    """Detection limit of one coefficient.
 
     Attributes:
-        size: half its 95 % interval; of a limit or gap, where it begins to show; infinite where
-            these data do not touch it.
-        leaning: where one step from zero would take it, (2); zero of a limit or gap.
-        limit: ``above`` of a gap, which shows from that size on; ``below`` of a limit, which shows
-            up to it; empty for what is a matter of proportion.
-        mixed: numbers of the model that it is mixed up with.
-        vague: whether it could be larger than all that is plausible.
+        size: Half its 95 % interval; for a limit or backlash the size at which it is detectable;
+            infinite if the data are insensitive to it.
+        leaning: Estimate after one Gauss-Newton step from zero, (2); zero for a limit or backlash.
+        limit: ``above`` for backlash, which is detectable from that size on; ``below`` for a limit,
+            which is detectable up to it; empty for proportional effects.
+        mixed: Parameters of the model that are confounded with it.
+        vague: Whether it could be larger than all plausible values.
     """
 
     size: float
@@ -75,20 +77,20 @@ class Reach:
 
     @property
     def leans(self) -> bool:
-        """Whether it would not be zero, if it were fitted."""
+        """Return whether its estimate would differ from zero if it were fitted."""
         return abs(self.leaning) > self.size
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What runs show about a fitted model.
+    """Detection limits and parameter uncertainty at a fitted model.
 
     Attributes:
-        free: names of the numbers of the model that were fitted.
-        covariance: (q, q) of them.
-        reaches: by effect and coefficient, of what is not in it.
-        another: by name, half the 95 % interval of a number of the model in a log, or a run, not
-            yet recorded; of those of which several say something.
+        free: Names of the fitted parameters of the model.
+        covariance: (q, q) covariance of these parameters.
+        reaches: Detection limits of absent effects, by effect and coefficient.
+        another: Half the 95 % interval of a parameter in a log, or a run, that is not yet recorded,
+            by name; only for parameters that several groups identify.
     """
 
     free: tuple[str, ...]
@@ -98,26 +100,26 @@ class Shown:
 
 
 def shown(world: World, extended: Extended, names: Sequence[str]) -> Shown:
-    """What runs show about an extended simulator.
+    """Compute the detection limits of effects that an extended simulator does not contain.
 
     Args:
-        world: the runs; it has the effects of the simulator, and those in question.
-        extended: the simulator.
-        names: effects in question, none of which it has.
+        world: Run evaluator of the runs, with the effects of the simulator and the absent ones.
+        extended: Extended simulator.
+        names: Absent effects.
 
     Raises:
-        InputError: it does not follow the runs at all.
+        InputError: The simulation fails on the runs.
     """
     floor = noise_floor(world, world.recording)
     white = Noise(floor.sigma, np.zeros(len(floor.sigma)))
     fit = _fitted(world, extended, white)
     if not np.isfinite(fit.simulated[np.isfinite(world.observed)]).all():
         raise InputError(f"{world.recording.path}: the simulation of it fails")
-    # Nothing is drawn from the stream, as nothing is searched.
+    # The random stream is not used, because there is no search.
     models = Models(world, white, frozenset(), rng_for("sheet"), floor.stated)
     model = models.enter(fit)
     left = model.likelihood
-    # What the model leaves is the noise, whatever the recording states of it.
+    # The residual of the model is taken as the noise, whatever the recording specifies.
     noise = Noise(np.maximum(left.sigma, 1e-300), left.phi)
     found = _with_small_gaps(world, fit, directions(world, fit, names))
     about = _Shown(world, noise, derived(models, fit), found, models.residual(fit))
@@ -125,15 +127,13 @@ def shown(world: World, extended: Extended, names: Sequence[str]) -> Shown:
 
 
 def _another(found: Sequence[Spread]) -> dict[str, float]:
-    """By name, the interval of a number in a group not yet recorded: a log, or else a run."""
+    """Return half the prediction interval of each parameter for a new log, or else a new run."""
     by_run = {one.number: Z95 * one.total for one in found if one.by == "run"}
     return by_run | {one.number: Z95 * one.total for one in found if one.by == "log"}
 
 
 def _with_small_gaps(world: World, fit: Fit, found: Directions) -> Directions:
-    """The directions with gaps smaller than a search tries: what is searched is to be found, and
-    here is asked what would have been.
-    """
+    """Add directions with smaller backlash than a search tries, to find the detection limit."""
     least: dict[str, Probe] = {}
     for probe in found.probes:
         gap = probe.fixed and world.effects[probe.effect].coefficients[0].of not in LIMITED
@@ -149,11 +149,11 @@ def _with_small_gaps(world: World, fit: Fit, found: Directions) -> Directions:
 
 
 def _fitted(world: World, extended: Extended, noise: Noise) -> Fit:
-    """The simulator on the runs, with derivatives; initial states are fitted, nothing else."""
+    """Evaluate the simulator on the runs with derivatives; only initial states are fitted."""
     theta = theta_of(world, extended)
     (measured,) = HeldOutRuns(world, noise).measure([theta])
     own = [extended.parameters.get(p.name) for p in world.parameters[: world.own]]
-    # What has no interval was not fitted.
+    # A parameter without an interval was not fitted.
     frozen = {i for i, number in enumerate(own) if number is None or number.low is None}
     start = Start(tuple(extended.effects), theta, measured.states)
     return Fitter(world, noise, frozenset(frozen)).fit([start], iterations=0)[0]
@@ -182,7 +182,7 @@ class _Shown:
         self.leaning = pull / np.maximum(self.powers, 1e-300)  # (2)
 
     def shown(self, another: Mapping[str, float]) -> Shown:
-        """Of each coefficient that scales, at the shape that shows best."""
+        """Compute the detection limit of each coefficient, at the shape that is detected best."""
         shapes: dict[tuple[str, int], list[int]] = {}
         for k in np.argsort(-self.powers, kind="stable").tolist():
             probe = self.found.probes[k]
@@ -192,7 +192,7 @@ class _Shown:
         limits = dict.fromkeys(probe.effect for probe in self.found.probes if probe.fixed)
         reaches = {}
         for (name, place), places in shapes.items():
-            # At the shape that shows best a richer law may be the simpler one that it contains.
+            # At that shape a richer law may be equivalent to a simpler one that it contains.
             own = [k for k in places if not self._told_already(name, k, best)]
             if name not in limits and own:
                 reaches[name, self._coefficient(name, place)] = self._proportional(own[0])
@@ -208,7 +208,7 @@ class _Shown:
         size = Z95 / np.sqrt(power) if power > 0 else np.inf
         parameter = self.world.parameters[self._place(self.found.probes[k])]
         low, high = parameter.bounds
-        # Beyond all that is plausible these data say nothing of it.
+        # The interval exceeds all plausible values, so the data say nothing about the coefficient.
         if 2.0 * size > UNBOUNDED * (high - low):
             return Reach(float(size), mixed=self._mixed(k), vague=True)
         return Reach(float(size), float(self.leaning[k]), mixed=self._mixed(k))
@@ -217,19 +217,20 @@ class _Shown:
         return self.world.places(probe.effect)[probe.place]
 
     def _mixed(self, k: int) -> tuple[str, ...]:
-        """Numbers of the model that do nearly the same as it together."""
+        """Return the parameters of the model that together have nearly the same influence."""
         i = self.q + k
         if self.powers[k] > (1.0 - MIXED**2) * self.left[i, i]:
             return ()
-        # What each does of it, as a share.
+        # Contributions are relative to the largest one.
         parts = np.abs(self.along[k]) * np.sqrt(np.diagonal(self.left)[: self.q])
         parts /= max(float(parts.max(initial=0.0)), 1e-300)
         order = np.argsort(-parts).tolist()
         return tuple(self.free[j] for j in order if parts[j] > PART)
 
     def _told_already(self, name: str, k: int, best: Mapping[tuple[str, int], int]) -> bool:
-        """Whether a simpler effect that this one contains has the same coefficient, in the model or
-        not.
+        """Return whether a simpler effect that this effect contains has an equivalent coefficient.
+
+        The simpler effect may be in the model or not.
         """
         simpler = set(self.world.effects[name].contains)
         others = [self.q + j for (other, _), j in best.items() if other in simpler]
@@ -247,7 +248,7 @@ class _Shown:
         probes = [(k, p) for k, p in enumerate(self.found.probes) if p.effect == name and p.fixed]
         sized = sorted((float(p.c[0]), k) for k, p in probes)
         sizes = [size for size, k in sized if np.sqrt(self.powers[k]) >= FAINT]
-        # A limit acts the more the smaller it is, a gap the larger it is.
+        # A limit has more influence the smaller it is, and backlash the larger it is.
         least, most = (self.left[self.q + k, self.q + k] for _, k in (sized[0], sized[-1]))
         below = bool(least > most)
         if not sizes:

@@ -1,4 +1,4 @@
-"""`simgap datasheet`: an explanation and its logs in, one page of a joint or actuator out."""
+"""Build and write the data sheet of a joint or actuator (`simgap datasheet`)."""
 
 from __future__ import annotations
 
@@ -31,15 +31,22 @@ TRANSMISSION = frozenset({"joint.backlash", "joint.coupling", "joint.flexibility
 
 
 class DataSheet(Facts):
-    """The data sheet of a joint or actuator."""
+    """Data sheet of a joint or actuator that can be written to a folder."""
 
     @check_arguments
     def write(self, folder: str | Path) -> list[Path]:
-        """Write sheet.toml, .html and .pdf, class.xml and models that use it: all or none. The
-        folder is made where it is missing.
+        """Write sheet.toml, .html and .pdf, class.xml and models that use it: all or none.
+
+        A missing folder is created.
+
+        Args:
+            folder: Folder to write to.
+
+        Returns:
+            The files that were written.
 
         Raises:
-            InputError: the folder cannot be made or written to.
+            InputError: The folder cannot be created or written to.
         """
         import tomli_w
 
@@ -67,17 +74,17 @@ def sheet(
     joint: str | None = None,
     name: str | None = None,
 ) -> DataSheet:
-    """The data sheet of a joint or actuator.
+    """Build the data sheet of a joint or actuator.
 
     Args:
-        recording: the logs, as they were explained.
-        extended: what was found in them; its class is known.
-        verdict: the same, with its evidence.
-        joint: which, of a robot.
-        name: on the sheet; None for the joint's or the system's.
+        recording: Logs that were explained.
+        extended: Extended simulator that was identified from them; its class is known.
+        verdict: Verdict of the same diagnosis, with the evidence.
+        joint: Joint of a robot; None for the only one.
+        name: Name on the sheet; None for the name of the joint or the system.
 
     Raises:
-        InputError: there is no such joint, or the logs are not of the system.
+        InputError: The joint does not exist, or the logs are not of this system.
     """
     kind = extended.kind
     assert kind is not None
@@ -101,7 +108,7 @@ def sheet(
     engine = None if kind.own_engine else extended.engine
     world = World(kind, recording, recording.training(), engine, candidates=candidates)
     with closing(world):
-        # An effect on a channel that nobody recorded shows nowhere.
+        # An effect on a channel that is not recorded has no visible influence.
         there = [
             effect for effect in asked if not world.effects[effect].signal or _seen(world, effect)
         ]
@@ -112,7 +119,14 @@ def sheet(
 
 
 def absent(subject: Subject, extended: Extended) -> Iterator[str]:
-    """Effects that the model does not have here, without simpler forms of those that it has."""
+    """List effects that can act here but are not in the model.
+
+    Simpler forms of the effects in the model are left out.
+
+    Args:
+        subject: Joint or system of the sheet.
+        extended: Extended simulator.
+    """
     own = [
         effect
         for name, numbers in extended.effects.items()
@@ -128,16 +142,16 @@ def absent(subject: Subject, extended: Extended) -> Iterator[str]:
 
 
 def _needs_drive(name: str, effect: Effect | type[Effect]) -> bool:
-    """Whether an effect is one of a drive or of its transmission."""
+    """Return whether an effect belongs to a drive or its transmission."""
     return effect.at == "actuator" or name.partition("@")[0] in TRANSMISSION
 
 
 def _is_stop(effect: Effect | type[Effect]) -> bool:
-    """Whether an effect is a stop: it shows by where it is, and not from some stiffness on."""
+    """Return whether an effect is a stop, which shows by its position, not by its stiffness."""
     return effect.coefficients[0].of == "stop"
 
 
 def _seen(world: World, effect: str) -> bool:
-    """Whether the signal that an effect acts on was recorded."""
+    """Return whether the signal that an effect acts on was recorded."""
     run = world.runs[0]
     return world.effects[effect].signal in {*run.channels, *run.inputs}

@@ -1,4 +1,4 @@
-"""What a sheet is of: a joint of a robot with its actuators and sensors, or a system of one."""
+"""Subject of a data sheet: a joint of a robot with its actuators and sensors, or a system."""
 
 from __future__ import annotations
 
@@ -14,14 +14,18 @@ from sims.simulated import Simulated
 from sims.system import FAMILY, Effect
 
 PARTS = {"joint": "Joint", "actuator": "Actuator", "channel": "Sensor"}
-"""Kinds of places that belong to a joint, in the order of the sheet."""
+"""Titles of the kinds of places that belong to a joint, in the order of the sheet."""
 _SHARES = {"actuator.stiffness": "{force}/{length}", "actuator.damping": "{force}*s/{length}"}
-"""Units of what a file states where an effect is a share of it."""
+"""Units of numbers of the model file, for effects that are relative changes of these numbers."""
 
 
 class Stated(NamedTuple):
-    """What a model file states of a number, and its unit; and whether the effect is a share of it,
-    not a difference from it.
+    """Value that a model file specifies for a number.
+
+    Attributes:
+        value: Value in the model file.
+        unit: Unit of the value.
+        share: Whether the effect is a relative change of the value, not a difference from it.
     """
 
     value: float
@@ -29,14 +33,14 @@ class Stated(NamedTuple):
     share: bool
 
     def total(self, number: Number) -> Number:
-        """What the file says with an effect's coefficient."""
+        """Return the value of the model file with an effect's coefficient applied."""
         low, high = number.low, number.high
         if low is None or high is None:
             return Number(self._with(number.value), self.unit, None, None)
         return Number(self._with(number.value), self.unit, self._with(low), self._with(high))
 
     def half(self, half: float) -> float:
-        """Half an interval of the coefficient, as one of the total."""
+        """Convert half an interval of the coefficient to half an interval of the total."""
         return half * self.value if self.share else half
 
     def _with(self, c: float) -> float:
@@ -45,12 +49,12 @@ class Stated(NamedTuple):
 
 @dataclass(frozen=True)
 class Subject:
-    """What a sheet is of.
+    """Joint or system that a data sheet describes.
 
     Attributes:
-        kind: the simulator of its system.
-        joint: of a robot; empty for a system of one place.
-        places: names of the joint, its actuators and its channels.
+        kind: Simulator class of the system.
+        joint: Joint of a robot; empty for a system with a single place.
+        places: Names of the joint, its actuators and its channels.
     """
 
     kind: type[Simulated]
@@ -59,20 +63,22 @@ class Subject:
 
     @property
     def actuators(self) -> tuple[str, ...]:
-        """Names of those that drive the joint."""
+        """Names of the actuators that drive the joint."""
         return tuple(spot.name for spot in self._spots().get("actuator", ()) if self._on(spot))
 
     @property
     def linear(self) -> bool:
-        """Whether it slides, and does not turn."""
+        """Return whether the joint is prismatic, not rotary."""
         if not self.joint:
             return self.kind.system.kind != "rotary"
         (joint,) = (s for s in self._spots()["joint"] if s.name == self.joint)
         return bool(joint.kind == "slide")
 
     def is_driven(self, recording: Recording) -> bool:
-        """Return whether a drive acts here: an actuator of the robot's file, or an input of the
-        recording that is not always zero.
+        """Return whether a drive acts here.
+
+        A drive is an actuator of the robot's file, or an input of the recording that is not always
+        zero.
         """
         inputs = {
             name for run in recording.runs for name, signal in run.inputs.items() if signal.any()
@@ -82,20 +88,26 @@ class Subject:
         return bool(self.actuators) or f"force.{self.joint}" in inputs
 
     def has(self, effect: Effect | type[Effect]) -> bool:
-        """Whether an effect acts here, and at no more than one place."""
+        """Return whether an effect acts here and at one place only."""
         if effect.at not in PARTS or effect.place == FAMILY:
             return False
         return effect.place in self.places if self.joint else True
 
     def effects(self) -> Iterator[type[Effect]]:
-        """Every registered effect that can act here."""
+        """Yield every registered effect that can act here."""
         for effect in library.library(self.kind.system).values():
             if self.has(effect):
                 yield effect
 
     def own(self, name: str, numbers: Mapping[str, Number]) -> Iterator[tuple[str, str, Number]]:
-        """What an effect found somewhere is here: the name that it has here, and each of its
-        coefficients.
+        """Yield the coefficients that a fitted effect has here.
+
+        Args:
+            name: Name of the effect, possibly of a family.
+            numbers: Fitted coefficients.
+
+        Yields:
+            Name of the effect at this place, name of the coefficient, and its value.
         """
         base, _, place = name.partition("@")
         if place != FAMILY:
@@ -105,13 +117,14 @@ class Subject:
         there = [one.place for one in self.effects() if one.of == base]
         for key, number in numbers.items():
             coefficient, _, at = key.partition("@")
-            # What is late is late everywhere: one number that names no place.
+            # A family with one coefficient for all places, such as a delay, has the same value
+            # here.
             for one in [at] if at else there:
                 if one in self.places:
                     yield f"{base}@{one}", coefficient, number
 
     def stated(self, effect: str) -> Stated | None:
-        """What the model file states of what an effect changes; None where it says nothing."""
+        """Return the value in the model file that an effect changes; None if there is none."""
         base, _, place = effect.partition("@")
         for kind in ("joint", "actuator"):
             for spot in self._spots().get(kind, ()):
@@ -124,7 +137,7 @@ class Subject:
         share = base in _SHARES
         effect = library.find(f"{base}@{spot.name}", self.kind.system)
         unit = _SHARES[base] if share else effect.coefficients[0].units[0] or "1"
-        # A servo's bias pulls back: its sign is no part of a gain.
+        # A servo has a negative bias, but its gain is positive.
         value = abs(spot.stated[base])
         return Stated(value, unit.format(force=force, length=length), share)
 
@@ -138,14 +151,14 @@ class Subject:
 
 
 def subject_of(kind: type[Simulated], joint: str | None) -> Subject:
-    """What a sheet is of.
+    """Make the subject of a data sheet.
 
     Args:
-        kind: the simulator of the system.
-        joint: of a robot; None where there is one.
+        kind: Simulator class of the system.
+        joint: Joint of a robot; None for the only joint.
 
     Raises:
-        InputError: there is no such joint, or several and none is named.
+        InputError: The joint does not exist, or there are several and none is given.
     """
     if not kind.has_model:
         if joint is not None:

@@ -1,4 +1,4 @@
-"""How a data sheet says its numbers, on the page and in print."""
+"""Text of a data sheet's rows, on the page and in print."""
 
 from __future__ import annotations
 
@@ -9,31 +9,37 @@ from bench.gap.sheet.quantity import Quantity
 from bench.gap.sheet.subject import PARTS
 
 UNLIKELY = 0.05
-"""Chance above which a cause stands only because nobody had the time to judge it."""
+"""P-value above which a cause is on the sheet only because the search ended before it was judged.
+"""
 
 
 def title(row: Quantity, is_driven: bool) -> str:
-    """Name the part of the table that a row belongs to."""
+    """Return the title of the part of the table that a row belongs to.
+
+    Args:
+        row: Row of the sheet.
+        is_driven: Whether a drive acts on the joint or system.
+    """
     if row.part == "system":
         return "Motor" if is_driven else "System"
     return PARTS[row.part]
 
 
 def another(row: Quantity) -> str:
-    """How well it is known of a run or log not yet recorded."""
+    """Format half the prediction interval for a run or log that is not yet recorded."""
     return "" if row.another is None else f"± {number(row.another, 2)}"
 
 
 def called(row: Quantity) -> str:
-    """What a person calls it."""
+    """Return the name of the row in words."""
     if row.part == "system":
         return row.name.replace("_", " ")
-    # On a sheet stands the number itself, and not by how much a file is wrong.
+    # The sheet shows the value itself, not its difference from the model file.
     return row.says if row.stated is None else re.sub("^(wrong|misplaced) ", "", row.says)
 
 
 def short(row: Quantity) -> str:
-    """Its name without the joint or actuator that the whole sheet is of."""
+    """Return the name of the row without the joint or actuator that the whole sheet describes."""
     effect, _, rest = row.name.partition("@")
     if not rest:
         return row.name
@@ -43,7 +49,12 @@ def short(row: Quantity) -> str:
 
 
 def evidence(row: Quantity, short: bool = False) -> str:
-    """Why a number stands on the sheet."""
+    """Format the evidence for a number on the sheet.
+
+    Args:
+        row: Row of the sheet.
+        short: Whether to use the short form for print.
+    """
     if row.state == "derived":
         return "follows from those below"
     if row.state == "fitted":
@@ -62,7 +73,7 @@ def evidence(row: Quantity, short: bool = False) -> str:
 
 
 def reached(row: Quantity) -> str:
-    """How small a number these data would have shown."""
+    """Format the smallest value of an absent effect that these data would have revealed."""
     reach = row.reach
     if reach is None or reach.size == float("inf"):
         return "nothing: not touched"
@@ -77,7 +88,7 @@ def reached(row: Quantity) -> str:
 
 
 def beside(row: Quantity) -> str:
-    """What it is mixed up with, and what it might stand in place of."""
+    """Format confounded parameters, and causes that the effect might replace."""
     said = list(row.reach.mixed) if row.reach else []
     if row.instead:
         said.append(f"may be there instead of {joined(row.instead, 'or')}")
