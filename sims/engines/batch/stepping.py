@@ -116,7 +116,7 @@ class Stepping:
         self._try = np.full((count, 1), np.inf)  # seconds to an event
         self._goal = np.full(count, NOTHING, dtype=np.int8)
         self._events = np.zeros(count, dtype=np.intp)
-        # Open to events: under way to none, and not after too many.
+        # An element is open to events if none is pending and it has not had too many in this step.
         self._open = np.ones(count, dtype=bool)
         self._awaits = self._shortened = False
         if ground is not None:

@@ -1,7 +1,7 @@
 """Compile the functions that step elements into one piece of machine code.
 
-The compilation runs in a separate process (`main`). There, numba has the same settings whatever the
-user has set, and its memory is released afterwards.
+The compilation runs in a separate process (`main`). There, numba ignores the user's settings, and
+its memory is released afterwards.
 """
 
 from __future__ import annotations
