@@ -1,4 +1,4 @@
-"""The ball's world in MuJoCo: a sphere on three slides, which cannot spin, above a plane."""
+"""World of the ball in MuJoCo: a sphere on three slides, which cannot spin, above a plane."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 
 def model(constants: Mapping[str, float]) -> str:
-    """The world as MJCF; the joints are x, y, z, zero at the origin; the ball states what its
-    contact is like.
+    """Return the world as MJCF.
+
+    The joints are x, y, z, with zero at the origin; the contact uses the parameters of the ball.
     """
     size = constants["radius"]
     mass = constants["mass"]

@@ -1,11 +1,11 @@
-"""The ball as a registered simulator."""
+"""Registered simulator of the ball."""
 
 from sims.ball.system import BallSystem
 from sims.simulated import Simulated
 
 
 class Ball(Simulated):
-    """A ball that falls and bounces on level ground."""
+    """Ball that falls and bounces on level ground."""
 
     system = BallSystem
     default_engine = "pybullet"

@@ -1,4 +1,4 @@
-"""The ball: a sphere that falls freely and bounces on level ground, declared for every engine."""
+"""Ball: a sphere that falls freely and bounces on level ground, declared for every engine."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from sims.system import Kind, Moment, System, UsualRecording
 
 
 class BallSystem(System):
-    """A sphere on which gravity alone acts; it leaves level ground with restitution times its
-    impact speed.
+    """Sphere under gravity alone that rebounds with restitution times its impact speed.
 
-    States are the centre x, y, z [m], ground touched at z = radius, and its velocity vx, vy, vz
-    [m/s]. It does not spin, and the ground does not slow it along its plane unless an effect says
-    so. Force is counted per unit mass.
+    States are the centre x, y, z [m], with ground contact at z = radius, and its velocity vx, vy,
+    vz [m/s]. It does not spin, and the ground does not reduce its tangential speed unless an effect
+    does. Forces are per unit mass.
     """
 
     name = "ball"
@@ -65,15 +64,25 @@ class BallSystem(System):
     uniform = True
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """One: force is counted per unit mass."""
+        """Return one (L, 1): forces are per unit mass.
+
+        Args:
+            theta: (L, p) parameters.
+            constants: (L, 1) constants by name.
+        """
         return np.ones((len(theta), 1))
 
     def weight(self, moment: Moment) -> Array:
-        """Gravity, m/s^2."""
+        """Return the acceleration of gravity (L, D) in m/s^2."""
         return np.concatenate([np.zeros((len(moment.x), 2)), -moment.gravity], axis=1)
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
-        """A unit vector along the ground."""
+        """Return a unit vector (L, D) along a horizontal axis.
+
+        Args:
+            moment: state snapshot.
+            axis: horizontal axis of the acceleration.
+        """
         unit = np.zeros_like(moment.x)
         unit[:, "xy".index(axis)] = 1.0
         return unit
@@ -81,7 +90,14 @@ class BallSystem(System):
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """Position, and what an accelerometer on the ball shows along the vertical."""
+        """Return the position, and the vertical reading of an accelerometer on the ball.
+
+        Args:
+            x: (L, S, D) positions.
+            v: (L, S, D) velocities.
+            a: (L, S, D) accelerations.
+            constants: constants by name.
+        """
         return {
             "x": x[:, :, 0],
             "y": x[:, :, 1],
@@ -90,9 +106,9 @@ class BallSystem(System):
         }
 
     def floor(self, constants: Mapping[str, Array]) -> Array:
-        """The ball's radius."""
+        """Return the ball's radius."""
         return constants["radius"]
 
     def restitution(self, theta: Array) -> Array:
-        """The parameter."""
+        """Return the restitution parameter."""
         return theta[:, :1]

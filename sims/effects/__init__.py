@@ -1,4 +1,4 @@
-"""The library of effects: one family a module, registered by entry point as third parties' are."""
+"""Effect library: one effect family per module, registered by entry points as plugins are."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from sims.system import Effect, System
 
 registry: Registry[Effect] = Registry("effect", "simgap.effects", Effect)
 
-# What a user of the library asks it for reads `effects.get("drag.linear")`.
+# Users of the library call `effects.get("drag.linear")`.
 names = registry.names
 get = registry.get
 register = registry.register
 
 
 def library(system: type[System]) -> dict[str, type[Effect]]:
-    """Every usable effect that the system can have, by name."""
+    """Return every usable effect that the system can have, by name."""
     usable = {}
     for name in registry.names():
         try:
             effect = registry.get(name)
-        except SkippedError:  # whoever lists effects says why; explain does without
+        except SkippedError:  # the list of effects shows the reason; explain works without it
             continue
         for placed in system.placed(effect):
             usable[placed.name] = placed
@@ -27,9 +27,13 @@ def library(system: type[System]) -> dict[str, type[Effect]]:
 
 
 def find(name: str, system: type[System]) -> type[Effect]:
-    """The effect of a name on a system: one of its places, or a registered one.
+    """Return the effect of this name on a system: at one of its places, or a registered one.
+
+    Args:
+        name: name of the effect.
+        system: system on which the effect acts.
 
     Raises:
-        InputError: there is none.
+        InputError: no such effect exists.
     """
     return system.effect(name) or registry.get(name)

@@ -1,20 +1,20 @@
-"""What lies between the commanded input and the one the plant feels; acts on the first input.
+"""Input effects: transformations from the commanded to the applied first input.
 
-With u the command, w what the plant feels and c the coefficient:
+With u the command, w the applied input and c the coefficient:
 
-* (0) hold: w = u + c (v - u), with v the command that goes straight from sample to sample where
-  the recording says that it holds, or holds where it is said to go straight
+* (0) hold: w = u + c (v - u), with v the command interpolated linearly between samples if the
+  recording specifies a zero-order hold, or held if it specifies linear interpolation
 * (1) gain: w = (1 + c) u
 * (2) bias: w = u + c
 * (3) delay: w(t) = u(t - c)
-* (4) lag: c dw/dt = u - w; the plant feels its mean over each step (`sims.effects.lag`)
+* (4) lag: c dw/dt = u - w; the plant receives its mean over each step (`sims.effects.lag`)
 * (5) dead band: w = u - clip(u, -c, c)
 * (6) saturation: w = clip(u, -c, c)
-* (7) backlash: w stays while |u - w| <= c / 2, else it is pushed along by the nearer flank
+* (7) backlash: w is constant while |u - w| <= c / 2, otherwise the nearer flank pushes it
 * (8) power: w = (1 + gain) sign(u) |u|^(1 + power), |u| in the input's unit
 * (9) rate: dw/dt = clip((u - w) / h, -c, c) over a step h, from the first command on
 
-A negative delay leads; a negative lag, width or limit is none.
+A negative delay is a lead; a negative lag, width or limit counts as zero.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ _USUAL = ("m/s^2", "N", "N*m")
 _TIME = ("s", "s", "s")
 """Seconds, on every kind of system."""
 _PURE = ("1", "1", "1")
-"""A pure number, on every kind of system."""
+"""Units of a dimensionless coefficient on every kind of system."""
 _SHARE = ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
-"""Plausible gains: half as much more or less."""
+"""Plausible gains: up to 50 % more or less."""
 _SCALE = ((-0.9, 9), (-0.9, 9), (-0.9, 9))
-"""Plausible gains beside a power: at inputs far from one unit its scale is another."""
+"""Plausible gains combined with a power, which changes the scale far from one unit."""
 _EXPONENT = ((-0.5, 2), (-0.5, 2), (-0.5, 2))
-"""Plausible powers beyond the first."""
+"""Plausible additions to the exponent one."""
 _LEAST = 0.01
-"""The least power: of none the sign alone would act."""
+"""Smallest exponent; with zero, only the sign of the input would act."""
 _OFFSET = ((-2, 2), (-2, 2), (-0.2, 0.2))
 """Plausible biases, in the units of `_USUAL`."""
 _WIDTH = ((0, 2), (0, 2), (0, 0.2))
-"""Plausible widths of dead band and play, in the units of `_USUAL`."""
+"""Plausible widths of dead band and backlash, in the units of `_USUAL`."""
 _LIMIT = ((0, 10), (0, 10), (0, 2))
 """Plausible limits, in the units of `_USUAL`."""
 _PER_SECOND = ("m/s^3", "N/s", "N*m/s")
@@ -50,25 +50,28 @@ _PER_SECOND = ("m/s^3", "N/s", "N*m/s")
 _SLEW = ((0, 50), (0, 50), (0, 10))
 """Plausible limits of the rate, in the units of `_PER_SECOND`."""
 _DELAY = (-0.05, 0.2)
-"""Plausible delays, s: stamps may be late by a sample or two, so that a command seems to lead."""
+"""Plausible delays in s.
+
+Time stamps may be late by one or two samples, so that a command seems to lead.
+"""
 _FEEDBACK = "K. J. Astrom, R. M. Murray, Feedback Systems (2008)"
 _NONLINEAR = "H. K. Khalil, Nonlinear Systems (2002), section 1.2"
 _PLAY = "M. Nordin, P.-O. Gutman, Automatica 38(10), 1633 (2002), doi:10.1016/S0005-1098(02)00047-X"
 
 
 class Hold(Input):
-    """Between samples, the command as the recording does not say; mixed where c is a share."""
+    """Command held instead of interpolated between samples, or vice versa; a mixture for c < 1."""
 
     name = "input.hold"
     noun = "an input read the other way between samples"
     says = "between two samples the input goes straight instead of holding, or holds instead"
     source = "K. J. Astrom, B. Wittenmark, Computer-Controlled Systems (1997), chapter 7"
     coefficients = (Coefficient("coefficient", _PURE, ((0, 1), (0, 1), (0, 1))),)
-    between = True  # (0), where means over steps are taken: `sims.plan`
+    between = True  # (0), applied where means over steps are computed: `sims.plan`
 
 
 class Gain(Input):
-    """The input times 1 + c."""
+    """Input times 1 + c."""
 
     name = "input.gain"
     noun = "an input gain"
@@ -77,12 +80,17 @@ class Gain(Input):
     coefficients = (Coefficient("coefficient", _PURE, _SHARE),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
-        """In proportion."""
+        """Return the scaled input (L, S).
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         return signal.values * (1.0 + c[0])  # (1)
 
 
 class Bias(Input):
-    """The input plus c."""
+    """Input plus c."""
 
     name = "input.bias"
     noun = "an input bias"
@@ -91,12 +99,17 @@ class Bias(Input):
     coefficients = (Coefficient("coefficient", _USUAL, _OFFSET, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
-        """Shifted."""
+        """Return the shifted input (L, S).
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         return signal.values + c[0]  # (2)
 
 
 class Delay(Input):
-    """The input of c seconds ago."""
+    """Input delayed by c seconds."""
 
     name = "input.delay"
     noun = "an input delay"
@@ -105,12 +118,17 @@ class Delay(Input):
     coefficients = (Coefficient("coefficient", _TIME, (_DELAY, _DELAY, _DELAY)),)
 
     def times(self, c: Array, t: Array) -> Array:
-        """Earlier instants."""
+        """Return the earlier times (L, S) whose command is applied.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            t: (L, S) times in seconds.
+        """
         return t - c[0]  # (3)
 
 
 class Lag(Input):
-    """The input through a first-order lag with time constant c, settled at its first value."""
+    """Input through a first-order lag with time constant c, settled at its first value."""
 
     name = "input.lag"
     noun = "an input lag"
@@ -119,13 +137,18 @@ class Lag(Input):
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.5), (0, 0.5), (0, 0.5))),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
-        """The lagged input's mean over each step."""
+        """Return the mean (L, S) of the lagged input over each step.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         # (4); without a lag the command itself, bit for bit
         return np.where(c[0] > 0, _lagged(signal, c[0]), signal.values)
 
 
 class Deadband(Input):
-    """Nothing while the input is within c of zero, the excess beyond."""
+    """Input with dead band: zero while it is within c of zero, otherwise the excess."""
 
     name = "input.deadband"
     noun = "an input dead band"
@@ -134,15 +157,20 @@ class Deadband(Input):
     coefficients = (Coefficient("coefficient", _USUAL, _WIDTH, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
-        """What exceeds the half width."""
+        """Return the excess (L, S) over the half width.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         half = np.abs(c[0])
-        # what exceeds, not what passes a gate: felt input stays continuous at the border
+        # the excess, not the whole value: the applied input is continuous at the border
         beyond = signal.values - np.clip(signal.values, -half, half)  # (5)
         return np.where(c[0] > 0, beyond, signal.values)
 
 
 class Saturation(Input):
-    """The input limited to c either way; a limit of zero is none."""
+    """Input limited to c in both directions; a limit of zero is no limit."""
 
     name = "input.saturation"
     noun = "input saturation"
@@ -151,15 +179,20 @@ class Saturation(Input):
     coefficients = (Coefficient("coefficient", _USUAL, _LIMIT, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
-        """What stays within the limit."""
+        """Return the limited input (L, S).
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         limit = np.abs(c[0])
         limited = np.clip(signal.values, -limit, limit)  # (6)
-        # a limit of zero is off, as every effect's zero: it does not cut everything
+        # a limit of zero is off, as the zero of every effect, and does not set the input to zero
         return np.where(c[0] > 0, limited, signal.values)
 
 
 class Backlash(Input):
-    """Play of full width c, at its middle when the run starts."""
+    """Backlash of full width c, centred when the run starts."""
 
     name = "backlash"
     noun = "backlash"
@@ -168,13 +201,18 @@ class Backlash(Input):
     coefficients = (Coefficient("coefficient", _USUAL, _WIDTH, of="input"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
-        """What the far side of the play does."""
+        """Return the input (L, S) on the load side of the backlash.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         played = _pushed(signal, c[0] / 2)
         return np.where(c[0] > 0, played, signal.values)
 
 
 class Power(Input):
-    """The input to a power, as a propeller's thrust goes with the square of its speed."""
+    """Input to a power, as a propeller's thrust is quadratic in its speed."""
 
     name = "input.power"
     noun = "a power of the input"
@@ -184,14 +222,19 @@ class Power(Input):
     coefficients = (Coefficient("gain", _PURE, _SCALE), Coefficient("power", _PURE, _EXPONENT))
 
     def feel(self, c: Array, signal: Signal) -> Array:
-        """In proportion to the power of its size; an input of one unit stays, but for the gain."""
+        """Return the input (L, S) to a power; an input of one unit changes only by the gain.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         size = np.abs(signal.values)
         bent = np.sign(signal.values) * size ** np.maximum(1.0 + c[1], _LEAST)
         return (1.0 + c[0]) * np.where(c[1] != 0, bent, signal.values)  # (8)
 
 
 class Rate(Input):
-    """The input follows no faster than c a second; a limit of zero is none."""
+    """Input with a rate of at most c per second; a limit of zero is no limit."""
 
     name = "input.rate"
     noun = "a limit of the input's rate"
@@ -200,40 +243,47 @@ class Rate(Input):
     coefficients = (Coefficient("coefficient", _PER_SECOND, _SLEW, of="input/s"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
-        """The mean over each step of what is reached at the limit."""
+        """Return the mean (L, S) of the rate-limited input over each step.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         limit = np.where(c[0] > 0, c[0], np.inf)
         return np.where(c[0] > 0, _slewed(signal, limit), signal.values)
 
 
 def _lagged(signal: Signal, lag: Array) -> Array:
-    """Means (L, S) over each step of (4), `lag` (L, 1) in seconds."""
-    # the command is constant over a step, so (2) of sims.effects.lag leads from end to end
+    """Return means (L, S) of the lagged input (4) over each step; `lag` (L, 1) is in seconds."""
+    # the command is constant over a step, so (2) of sims.effects.lag gives the value at its end
     decay, mean = response(signal.steps, lag)
     ends = recur(decay, (1.0 - decay) * signal.values, signal.start)
-    # engines hold the input over a step: its mean gives the momentum that the lagged one gives
+    # engines hold the input over a step: the mean transfers the same momentum as the lagged input
     return signal.values + (before(ends, signal.start) - signal.values) * mean
 
 
 def _pushed(signal: Signal, half: Array) -> Array:
-    """What is pushed to and fro (L, S) by (7), `half` (L, 1) the play to either side."""
-    # Step by step in rows, which lie together in memory.
+    """Return the input (L, S) after backlash (7), with clearance `half` (L, 1) to either side."""
+    # The loop runs over contiguous rows, one per step.
     low = np.ascontiguousarray((signal.values - half).T)
     high = np.ascontiguousarray((signal.values + half).T)
-    # where in its play a drive rests is not recorded: the middle favours neither direction
+    # the position within the backlash is not recorded: the centre favours neither direction
     state: Array = signal.start[:, 0]
     for below, above in zip(low, high, strict=True):
-        # (7), without the overhead of np.clip, in place: what was low is the result
+        # (7), in place and without the overhead of np.clip: the array of lower bounds becomes the
+        # result
         np.maximum(state, below, out=below)
         state = np.minimum(below, above, out=below)
     return low.T
 
 
 def _slewed(signal: Signal, limit: Array) -> Array:
-    """Means (L, S) over each step of (9), `limit` (L, 1) of the rate, endless where there is
-    none.
+    """Return means (L, S) of the rate-limited input (9) over each step.
+
+    `limit` (L, 1) is the largest rate, infinite for no limit.
     """
     wanted = np.ascontiguousarray(signal.values.T)
-    # An endless limit over a step of no length is none.
+    # An infinite limit times a step of zero length counts as zero.
     reach = np.where(signal.steps > 0, limit * np.where(signal.steps > 0, signal.steps, 1.0), 0.0).T
     back = -reach
     moved = np.empty_like(wanted)
@@ -244,7 +294,7 @@ def _slewed(signal: Signal, limit: Array) -> Array:
         np.minimum(move, up, out=move)
         np.maximum(move, down, out=move)
         state = np.add(state, move, out=end)
-    # It rises for as long as the limit asks, and stays for the rest of the step.
+    # It rises until it reaches the command, and is constant for the rest of the step.
     rising = np.abs(moved) / np.where(reach > 0, reach, np.inf)
     means = ends - 0.5 * rising * moved
     return np.where(np.isfinite(reach), means, wanted).T

@@ -1,4 +1,4 @@
-"""What happens at an impact with the ground.
+"""Contact effects: changes of the impact with the ground.
 
 With e0 the simulator's restitution, vn the normal speed before the impact and c the coefficient:
 
@@ -14,13 +14,13 @@ from sims.base import Array
 from sims.system import Coefficient, Contact
 
 _SMALLEST = 1e-9
-"""m/s; a slower impact counts as one of this speed, so that a negative power of it is finite."""
+"""Minimum impact speed in m/s for the power law, so that a negative power is finite."""
 _POWER = ((-0.4, 0.2), (-0.4, 0.2), (0, 0))
 """Plausible powers of the impact speed: yielding bodies have about -1/4, viscoelastic ones less."""
 
 
 class Speed(Contact):
-    """Restitution that depends on the impact speed; at most 1, so that no energy is made."""
+    """Restitution that depends on the impact speed; at most 1, so that no energy is created."""
 
     name = "restitution.speed"
     noun = "speed-dependent restitution"
@@ -30,9 +30,15 @@ class Speed(Contact):
     coefficients = (Coefficient("coefficient", ("1", "1", None), _POWER),)
 
     def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:
-        """As much as it would be at 1 m/s, times a power of the speed."""
+        """Return the restitution (L, 1): its value at 1 m/s, times a power of the speed.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            restitution: (L, 1) restitution without the effect.
+            speed: (L, 1) impact speed in m/s.
+        """
         scaled = restitution * np.maximum(speed, _SMALLEST) ** c[0]  # (1)
-        # a restitution that was above 1 without it stays: c = 0 is off
+        # a restitution above 1 without the effect stays: c = 0 is off
         return np.minimum(scaled, np.maximum(restitution, 1.0))
 
 
@@ -47,6 +53,6 @@ class Friction(Contact):
     coefficients = (Coefficient("coefficient", ("1", None, None), ((0, 1), (0, 0), (0, 0))),)
 
     def friction(self, c: Array) -> Array:
-        """The coefficient of friction; a negative one is none."""
-        # the engine applies (2): it alone knows the tangential speed there is
+        """Return the friction coefficient (L, 1); a negative one counts as zero."""
+        # the engine applies (2), because only the engine knows the tangential speed
         return np.maximum(c[0], 0.0)

@@ -1,4 +1,4 @@
-"""Drag: what a fluid or a bearing does to motion, in air that may move.
+"""Drag effects: resistance of a fluid or a bearing, in air that may move.
 
 With v the velocity and w that of the air:
 
@@ -6,9 +6,9 @@ With v the velocity and w that of the air:
 * (2) quadratic: F = -c |v| v
 * (3) wind: F = -c |v - w| (v - w)
 
-The drag of a sphere of mass m is ``c = rho Cd A / (2 m)`` per unit mass. Wind carries that drag
-itself, so it stands in place of quadratic drag, not beside it: with drag in proportion to speed it
-would be one number, but the same as a tilt.
+The drag of a sphere of mass m is ``c = rho Cd A / (2 m)`` per unit mass. Wind includes quadratic
+drag and replaces it. With drag proportional to speed, the wind would need only one coefficient, but
+would be equivalent to a tilt.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sims.system import Coefficient, Force, Moment
 
 _FLUIDS = "G. K. Batchelor, An Introduction to Fluid Dynamics (1967), doi:10.1017/CBO9780511800955"
 _FLUID = ("1/m", "N*s^2/m^2", "N*m*s^2/rad^2")
-"""Units of drag that grows with the square of speed."""
+"""Units of the coefficient of drag that is quadratic in speed."""
 
 
 class Linear(Force):
@@ -35,7 +35,12 @@ class Linear(Force):
     )
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Against the velocity."""
+        """Return the force (L, D), opposite to the velocity.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         return -c[0] * moment.v  # (1)
 
 
@@ -49,12 +54,17 @@ class Quadratic(Force):
     coefficients = (Coefficient("coefficient", _FLUID, ((0, 0.3), (0, 5), (0, 0.02))),)
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Against the velocity."""
+        """Return the force (L, D), opposite to the velocity.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         return -c[0] * moment.speed * moment.v  # (2)
 
 
 class Wind(Force):
-    """Quadratic drag in air that moves horizontally with w: -c |v - w| (v - w)."""
+    """Quadratic drag in air that moves horizontally with velocity w: -c |v - w| (v - w)."""
 
     name = "wind"
     noun = "wind"
@@ -67,17 +77,23 @@ class Wind(Force):
     )
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Against the velocity relative to the air."""
+        """Return the force (L, D), opposite to the velocity relative to the air.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         return -c[0] * _squared(moment.v - _air(c, moment))  # (3)
 
 
 def _squared(v: Array) -> Array:
-    """|v| v, (L, D)."""
+    """Return |v| v, (L, D)."""
     return np.sqrt((v * v).sum(axis=1, keepdims=True)) * v
 
 
 def _air(c: Array, moment: Moment) -> Array:
-    """Velocity (L, D) of the air along the coordinates, which push and mass tell from x and y."""
-    # a push is what 1 m/s^2 of everything does: force over mass turns it into the axis's direction
+    """Return the velocity (L, D) of the air along the system's coordinates."""
+    # `push` is the force of 1 m/s^2 of acceleration: divided by the mass, it gives the direction of
+    # the axis
     mass = moment.system.mass(moment.theta, moment.constants)
     return (c[1] * moment.push("x") + c[2] * moment.push("y")) / mass

@@ -1,5 +1,6 @@
-"""Forces from outside, along the primary coordinate (a ball's height): constant, periodic in
-position or in time.
+"""External forces along the primary coordinate: constant, periodic in position or in time.
+
+The primary coordinate of a ball is its height.
 
 With x the primary coordinate and t the time since the start of the run:
 
@@ -7,8 +8,8 @@ With x the primary coordinate and t the time since the start of the run:
 * (2) ripple: F = a sin(2 pi x / period) + b cos(2 pi x / period)
 * (3) periodic: F = a sin(2 pi frequency t) + b cos(2 pi frequency t)
 
-What repeats is a sine and a cosine rather than an amplitude and a phase: the motion answers to both
-in proportion while they are small, and no phase is left undetermined where the amplitude is zero.
+Periodic forces have sine and cosine coefficients instead of amplitude and phase: the motion is
+linear in both while they are small, and no phase is undetermined where the amplitude is zero.
 """
 
 from __future__ import annotations
@@ -19,20 +20,23 @@ from sims.base import Array
 from sims.system import Coefficient, Force, Moment
 
 _SMALLEST = 1e-9
-"""m or rad; the period that stands for zero, by which nothing can be divided."""
+"""Smallest period in m or rad, which replaces zero to avoid division by zero."""
 _USUAL = ("m/s^2", "N", "N*m")
 """Units of a force on the three kinds of system."""
 _COGGING = (
     "T. M. Jahns, W. L. Soong, IEEE Trans. Ind. Electron. 43(2), 321 (1996), doi:10.1109/41.491356"
 )
 _RIPPLE = ((-2, 2), (-2, 2), (-0.2, 0.2))
-"""Plausible ripples, in the units of `_USUAL`."""
+"""Plausible amplitudes of ripple, in the units of a force."""
 _PERIOD = ((0.01, 1), (0.01, 1), (0.05, 3.1416))
-"""Plausible periods, m or rad; twice a turn at least: what repeats once a turn is gravity."""
+"""Plausible periods in m or rad.
+
+The longest is half a turn, because a force with the period of one turn is equivalent to gravity.
+"""
 
 
 class Bias(Force):
-    """A constant force c."""
+    """Constant force c."""
 
     name = "force.bias"
     noun = "a constant force"
@@ -41,12 +45,17 @@ class Bias(Force):
     coefficients = (Coefficient("coefficient", _USUAL, ((-2, 2), (-5, 5), (-0.5, 0.5))),)
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """The coefficient."""
+        """Return the force (L, D), equal to the coefficient along the primary coordinate.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         return moment.along_primary(c[0])  # (1)
 
 
 class Ripple(Force):
-    """A force that repeats with position, as a motor's cogging."""
+    """Force that is periodic in position, as a motor's cogging."""
 
     name = "force.ripple"
     noun = "a force periodic in position"
@@ -59,12 +68,17 @@ class Ripple(Force):
     )
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Periodic in the primary coordinate."""
+        """Return the force (L, D), periodic in the primary coordinate.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         return moment.along_primary(_wave(c, moment.primary / np.maximum(c[2], _SMALLEST)))  # (2)
 
 
 class Periodic(Force):
-    """A force that repeats with time since the start of the run."""
+    """Force that is periodic in the time since the start of the run."""
 
     name = "force.periodic"
     noun = "a force periodic in time"
@@ -77,12 +91,17 @@ class Periodic(Force):
     )
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Periodic in time."""
+        """Return the force (L, D), periodic in time.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         return moment.along_primary(_wave(c, moment.t * c[2]))  # (3)
 
 
 def _wave(c: Array, cycles: Array) -> Array:
-    """(L, 1) c[0] sin + c[1] cos, after so many cycles."""
+    """Return c[0] sin + c[1] cos (L, 1) at a phase given in cycles."""
     angle = 2 * np.pi * cycles
     wave: Array = c[0] * np.sin(angle) + c[1] * np.cos(angle)
     return wave

@@ -1,24 +1,24 @@
-"""Dry friction: opposes motion, and holds still at rest what pulls less than its limit.
+"""Dry friction: opposes motion, and holds the body at rest while forces are within its limit.
 
-Each law gives its limit; the engine adds the limits up and applies one force, so that sticking
-sticks. With v the velocity, limits are
+Each law gives its limit. The engine adds the limits and applies one force, so that sticking is
+exact. With v the velocity, limits are
 
 * (1) Coulomb: c
 * (2) Stribeck: coulomb + extra exp(-(v / speed)^2)
-* (3) load: c |drive - load|, each counted as it pushes the joint
+* (3) load: c |drive - load|, each counted in the direction in which it pushes the joint
 * (4) load, by direction: |motor drive - external load|
 * (5) load, quadratic: c |drive - load| + quadratic through^2, where `through` is the smaller of
-  drive and load as far as they pull against each other: what goes through the gears
+  drive and load if they pull against each other: the force transmitted by the gears
 * (6) position: least + a + sine sin(2 pi x / period) + cosine cos(2 pi x / period), with a the
-  amplitude (sine^2 + cosine^2)^(1/2), so that friction is `least` where it is least
+  amplitude (sine^2 + cosine^2)^(1/2), so that the minimum of friction is `least`
 * (7) warming: (dry + viscous |v|) exp(-t / time), t since the start of the run
 
-A negative limit is none. And one that is no limit but a force, since it vanishes at rest:
+A negative limit counts as zero. One law is a force instead of a limit, since it vanishes at rest:
 
 * (8) direction: -viscous+ v where v > 0, -viscous- v where v < 0
 
-Dry friction that differs by direction needs no law of its own: with limits d+ and d- it is, at rest
-as in motion, Coulomb friction of (d+ + d-) / 2 and a constant force of -(d+ - d-) / 2.
+Dry friction that differs by direction needs no separate law: with limits d+ and d- it is, at rest
+and in motion, Coulomb friction of (d+ + d-) / 2 and a constant force of -(d+ - d-) / 2.
 """
 
 from __future__ import annotations
@@ -43,35 +43,35 @@ _PLACE = (
     " Proc. IEEE ICRA, 1422 (1988)"
 )
 _SMALLEST = 1e-9
-"""What stands for a speed, a period or a time of zero, so that 0 / 0 never comes up."""
+"""Smallest speed, period or time, which replaces zero to avoid 0 / 0."""
 _USUAL = ("m/s^2", "N", "N*m")
 """Units of a force on the three kinds of system."""
 _VISCOUS = (None, "N*s/m", "N*m*s/rad")
-"""Units of a viscous friction, where motion has two ways."""
+"""Units of viscous friction on the kinds of system that can move in two directions."""
 _DAMPED = ((0, 0), (0, 5), (0, 0.05))
-"""Plausible ones, in the units of `_VISCOUS`."""
+"""Plausible viscous friction, in the units of `_VISCOUS`."""
 _LOAD = Coefficient("coefficient", (None, "1", "1"), ((0, 0), (0, 0.5), (0, 0.5)))
-"""Friction by load: a share of it."""
+"""Coefficient of load-dependent friction, as a fraction of the load."""
 _DRY = ((0, 5), (0, 5), (0, 0.5))
-"""Plausible limits, in the units of `_USUAL`."""
+"""Plausible friction limits, in the units of a force."""
 _WAVE = ((-5, 5), (-5, 5), (-0.5, 0.5))
-"""Plausible amplitudes over the joint, in the units of `_USUAL`."""
+"""Plausible amplitudes of friction that varies with position, in the units of a force."""
 _PERIOD = ((0.2, 5), (0.2, 5), (0.5, 6.2832))
-"""Plausible periods, m or rad: once a turn, and a few times."""
+"""Plausible periods in m or rad: from one period per turn to several."""
 _OVER = (
     Coefficient("sine", _USUAL, _WAVE),
     Coefficient("cosine", _USUAL, _WAVE),
     Coefficient("period", ("m", "m", "rad"), _PERIOD),
 )
-"""A wave over position."""
+"""Coefficients of a wave over position."""
 _SQUARE = ((None, "1/N", "1/(N*m)"), ((0, 0), (0, 0.1), (0, 1)))
-"""Unit and plausible size of friction per square of a force."""
+"""Units and plausible values of the coefficient of a squared force."""
 _COLD = (
     Coefficient("dry", _USUAL, _DRY),
     Coefficient("viscous", _VISCOUS, _DAMPED),
     Coefficient("time", ("s", "s", "s"), ((0.5, 500), (0.5, 500), (0.5, 500))),
 )
-"""Of warming."""
+"""Coefficients of friction that decreases by warming."""
 
 
 class Coulomb(Friction):
@@ -85,12 +85,17 @@ class Coulomb(Friction):
     coefficients = (Coefficient("coefficient", _USUAL, _DRY),)
 
     def limit(self, c: Array, moment: Moment) -> Array:  # noqa: ARG002
-        """The coefficient."""
+        """Return the limit (L, 1), equal to the coefficient.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         return np.maximum(c[0], 0.0)  # (1)
 
 
 class Stribeck(Friction):
-    """Friction that falls as motion picks up: coulomb + extra exp(-(v / speed)^2)."""
+    """Friction that decreases with speed: coulomb + extra exp(-(v / speed)^2)."""
 
     name = "friction.stribeck"
     noun = "Stribeck friction"
@@ -103,14 +108,17 @@ class Stribeck(Friction):
     )
 
     def limit(self, c: Array, moment: Moment) -> Array:
-        """`coulomb` in fast motion, `coulomb` + `extra` at rest."""
+        """Return the limit (L, 1): `coulomb` in fast motion, `coulomb` + `extra` at rest.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         return np.maximum(c[0] + c[1] * _falling(moment.speed, c[2]), 0.0)  # (2)
 
 
 class Load(Friction):
-    """Friction of a loaded transmission: c times the drive from one side plus the load from the
-    other.
-    """
+    """Friction of a loaded transmission, proportional to |drive - load|."""
 
     name = "friction.load"
     noun = "load-dependent friction"
@@ -120,12 +128,20 @@ class Load(Friction):
     coefficients = (_LOAD,)
 
     def limit(self, c: Array, moment: Moment) -> Array:
-        """In proportion to the load."""
+        """Return the limit (L, 1), proportional to the load.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         return np.maximum(c[0], 0.0) * moment.load  # (3)
 
 
 class LoadDirection(Friction):
-    """The same, each side by a coefficient of its own: |motor drive - external load|."""
+    """Load-dependent friction with separate coefficients for motor and external load.
+
+    The limit is |motor drive - external load|.
+    """
 
     name = "friction.load_direction"
     noun = "load-dependent friction by direction"
@@ -134,13 +150,18 @@ class LoadDirection(Friction):
     coefficients = (replace(_LOAD, name="motor"), replace(_LOAD, name="external"))
 
     def limit(self, c: Array, moment: Moment) -> Array:
-        """What one side presses on the gears less the other."""
+        """Return the limit (L, 1): absolute weighted sum of drive and external load.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         drive, against = moment.sides
         return np.abs(np.maximum(c[0], 0.0) * drive + np.maximum(c[1], 0.0) * against)  # (4)
 
 
 class LoadQuadratic(Friction):
-    """The same with a part that grows with the square of what the gears transmit."""
+    """Load-dependent friction with a term quadratic in the force transmitted by the gears."""
 
     name = "friction.load_quadratic"
     noun = "friction that grows with load and its square"
@@ -149,13 +170,18 @@ class LoadQuadratic(Friction):
     coefficients = (_LOAD, Coefficient("quadratic", *_SQUARE))
 
     def limit(self, c: Array, moment: Moment) -> Array:
-        """In proportion to the load, and to the square of what goes through."""
+        """Return the limit (L, 1) from the load and the square of the transmitted force.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         through = _transmitted(*moment.sides)
         return np.maximum(c[0] * moment.load + c[1] * through**2, 0.0)  # (5)
 
 
 class Position(Friction):
-    """Dry friction of gears and bearings that are not round: a wave that never falls below zero."""
+    """Dry friction of eccentric gears and bearings: a wave over position that is never negative."""
 
     name = "friction.position"
     noun = "friction that varies over the joint"
@@ -164,14 +190,19 @@ class Position(Friction):
     coefficients = (Coefficient("least", _USUAL, _DRY), *_OVER)
 
     def limit(self, c: Array, moment: Moment) -> Array:
-        """Periodic in the primary coordinate."""
+        """Return the limit (L, 1), periodic in the primary coordinate.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         angle = 2 * np.pi * moment.primary / np.maximum(c[3], _SMALLEST)
         mean = c[0] + np.sqrt(c[1] ** 2 + c[2] ** 2)
         return np.maximum(mean + c[1] * np.sin(angle) + c[2] * np.cos(angle), 0.0)  # (6)
 
 
 class Warming(Friction):
-    """Dry and viscous friction that a cold joint has beyond its own, and loses as it warms."""
+    """Additional dry and viscous friction of a cold joint, which decays as the joint warms."""
 
     name = "friction.warming"
     noun = "friction that falls as the joint warms"
@@ -180,13 +211,18 @@ class Warming(Friction):
     coefficients = _COLD
 
     def limit(self, c: Array, moment: Moment) -> Array:
-        """What is left of both; the viscous part is none at rest."""
+        """Return the remaining limit (L, 1); the viscous part is zero at rest.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         left = np.exp(-moment.t / np.maximum(c[2], _SMALLEST))
         return (np.maximum(c[0], 0.0) + np.maximum(c[1], 0.0) * moment.speed) * left  # (7)
 
 
 class Direction(Force):
-    """Viscous friction that differs by the way of the motion."""
+    """Viscous friction that depends on the direction of motion."""
 
     name = "friction.direction"
     noun = "friction that differs by direction"
@@ -196,19 +232,24 @@ class Direction(Force):
     coefficients = tuple(Coefficient(f"viscous{way}", _VISCOUS, _DAMPED) for way in "+-")
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """In proportion to speed, by that of the way in which it moves."""
+        """Return the force (L, D), proportional to speed, with a coefficient per direction.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         ahead, back = np.maximum(moment.v, 0.0), np.minimum(moment.v, 0.0)
         return -c[0] * ahead - c[1] * back  # (8)
 
 
 def _transmitted(drive: Array, against: Array) -> Array:
-    """(L, 1) the smaller of two forces that press from either side; zero where they do not."""
+    """Return the smaller of two opposing forces (L, 1); zero where they do not oppose."""
     low, high = np.minimum(drive, against), np.maximum(drive, against)
     return np.maximum(low, 0.0) - np.minimum(high, 0.0)
 
 
 def _falling(speed: Array, scale: Array) -> Array:
-    """(L, 1) share of the extra friction of (2) that is left at a speed."""
+    """Return the remaining fraction (L, 1) of the extra friction of (2) at a speed."""
     ratio = speed / np.maximum(scale, _SMALLEST)
     left: Array = np.exp(-np.square(ratio))
     return left

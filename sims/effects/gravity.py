@@ -1,4 +1,4 @@
-"""Gravity that is not what the simulator takes it for.
+"""Gravity effects: errors of size and direction.
 
 * (1) scale: the weight times 1 + c
 * (2) tilt: accelerations x g and y g along the horizontal axes
@@ -10,9 +10,9 @@ from sims.base import Array
 from sims.system import Coefficient, Force, Moment
 
 _PURE = ("1", "1", "1")
-"""A pure number, on every kind of system."""
+"""Units of a dimensionless coefficient on every kind of system."""
 _FIFTH = ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))
-"""Plausible changes of gravity, as shares of it: a fifth."""
+"""Plausible relative changes of gravity: up to a fifth."""
 
 
 class Scale(Force):
@@ -26,12 +26,17 @@ class Scale(Force):
     coefficients = (Coefficient("coefficient", _PURE, _FIFTH),)
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """A share of the weight."""
-        return c[0] * moment.weight  # (1): the system's own force has the weight itself
+        """Return the force (L, D), a fraction of the weight.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
+        return c[0] * moment.weight  # (1): the system's own force already contains the weight
 
 
 class Tilt(Force):
-    """Gravity that leans: accelerations of x g and y g along the horizontal axes."""
+    """Tilted gravity: accelerations of x g and y g along the horizontal axes."""
 
     name = "gravity.tilt"
     noun = "a tilt of gravity"
@@ -44,5 +49,10 @@ class Tilt(Force):
     )
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Gravity's size, along the horizontal."""
+        """Return the force (L, D) of gravity along the horizontal axes.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         return moment.gravity * (c[0] * moment.push("x") + c[1] * moment.push("y"))  # (2)

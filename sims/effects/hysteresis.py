@@ -1,12 +1,12 @@
-"""Friction that remembers where it began: surfaces that yield before they slide.
+"""Friction hysteresis (Dahl model): surfaces deform before they slide.
 
-With v the velocity, F the limit and d the deflection, the friction is -F w, where w, which no
-sensor shows, goes towards the sign of the motion over about the deflection:
+With v the velocity, F the limit and d the deflection, the friction is -F w, where w, a hidden
+state, approaches the sign of the motion over a distance of about the deflection:
 
     w' = r - |r| w,  r = v / d, no faster than `FASTEST`                   (1)
 
-which at a steady speed is w = 1 - exp(-x / d) after a way of x from rest, and Coulomb friction
-where the deflection is next to nothing.
+At a steady speed this is w = 1 - exp(-x / d) after a distance x from rest, and Coulomb friction if
+the deflection is almost zero.
 """
 
 from __future__ import annotations
@@ -17,12 +17,14 @@ from sims.base import Array
 from sims.system import Coefficient, Hidden, Moment, State
 
 FASTEST = 400.0
-"""1/s with which friction follows a change of the motion: far above what a log shows, and slow
-enough to be stepped."""
+"""Maximum rate in 1/s at which friction follows a change of the motion.
+
+It is far above the rates visible in a log, and low enough to be integrated.
+"""
 _SMALLEST = 1e-9
-"""m or rad; the deflection that stands for none, by which nothing can be divided."""
+"""Smallest deflection in m or rad, which replaces zero to avoid division by zero."""
 _WAY = ((2e-4, 0.05), (2e-4, 0.05), (1e-3, 0.3))
-"""Plausible deflections before surfaces slide, m or rad."""
+"""Plausible deflections in m or rad before surfaces slide."""
 _DAHL = (
     Coefficient("coulomb", ("m/s^2", "N", "N*m"), ((0, 5), (0, 5), (0, 0.5))),
     Coefficient("deflection", ("m", "m", "rad"), _WAY),
@@ -30,7 +32,7 @@ _DAHL = (
 
 
 class Hysteresis(Hidden):
-    """Dry friction that builds up over a small way after each reversal (Dahl)."""
+    """Dry friction that builds up over a short distance after each reversal (Dahl model)."""
 
     name = "friction.hysteresis"
     noun = "friction with hysteresis"
@@ -40,7 +42,13 @@ class Hysteresis(Hidden):
     coefficients = _DAHL
 
     def act(self, c: Array, moment: Moment, state: State) -> tuple[Array, Array]:
-        """Against the way that it has come."""
+        """Return the force (L, D), and the rate (L, 1) of the hidden state.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+            state: hidden state w, as the velocity of the hidden coordinate.
+        """
         ratio = moment.v[:, :1] / np.maximum(c[1], _SMALLEST)
         rate = np.clip(ratio, -FASTEST, FASTEST)
         return moment.along_primary(-c[0] * state.v), rate - np.abs(rate) * state.v  # (1)

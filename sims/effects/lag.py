@@ -1,4 +1,4 @@
-"""A first-order lag, exact over steps of any length.
+"""First-order lag filter, exact over steps of any length.
 
 The lagged signal y of s obeys (1) T dy/dt = s - y. Over a step of length h from y0:
 
@@ -16,30 +16,41 @@ import numpy as np
 from sims.base import Array
 
 _SMALLEST = 1e-12
-"""Seconds; a lag this short is none on any step."""
+"""Smallest time constant in seconds; such a lag has no effect on any step."""
 
 
 def response(steps: Array, lag: Array) -> tuple[Array, Array]:
-    """What is left of an old value at the end of each step, exp(-h / T), and in its mean, m of (3).
+    """Return the remaining weight of an old value at the end of each step and in its mean.
+
+    The weights are exp(-h / T), and m of (3).
 
     Args:
-        steps: (L, S) lengths h, seconds.
-        lag: (L, 1) time constants T, seconds.
+        steps: (L, S) lengths h in seconds.
+        lag: (L, 1) time constants T in seconds.
 
     Returns:
-        Both (L, S).
+        Both weights (L, S).
     """
     ratio = steps / np.maximum(lag, _SMALLEST)
-    # a step of no length, where a lane waits, keeps the old value: the limit of m is 1
+    # a step of zero length, where an element waits, keeps the old value: the limit of m is 1
     divisor = np.where(ratio > 0, ratio, 1.0)
-    # expm1, since 1 - exp cancels where steps are short beside the lag
+    # expm1, since 1 - exp has cancellation if steps are much shorter than the lag
     mean = np.where(ratio > 0, -np.expm1(-ratio) / divisor, 1.0)
     return np.exp(-ratio), mean
 
 
 def recur(decay: Array, gained: Array, start: Array) -> Array:
-    """y[k] = decay[k] y[k - 1] + gained[k], (L, S), from y[-1] = start (L, 1)."""
-    # rows lie together in memory, and what was gained becomes the result
+    """Return the recursion y[k] = decay[k] y[k - 1] + gained[k].
+
+    Args:
+        decay: (L, S) factors.
+        gained: (L, S) additions.
+        start: (L, 1) value y[-1].
+
+    Returns:
+        Values y (L, S).
+    """
+    # rows are contiguous in memory, and the additions become the result
     result = np.ascontiguousarray(gained.T)
     kept = np.ascontiguousarray(decay.T)
     state: Array = start[:, 0]
@@ -51,5 +62,10 @@ def recur(decay: Array, gained: Array, start: Array) -> Array:
 
 
 def before(values: Array, start: Array) -> Array:
-    """(L, S) the value before each step."""
+    """Return the value (L, S) before each step.
+
+    Args:
+        values: (L, S) values at the end of each step.
+        start: (L, 1) value before the first step.
+    """
     return np.concatenate([start, values[:, :-1]], axis=1)

@@ -1,4 +1,4 @@
-"""Lift: force across the direction of flight.
+"""Lift: force perpendicular to the direction of flight.
 
 (1) F = s x v with s = c (0, -1, 0) + vertical (0, 0, 1), x the vector product.
 """
@@ -13,9 +13,9 @@ from sims.system import Coefficient, Force, Moment
 _SPINNING = "G. Robinson, I. Robinson, Physica Scripta 88, 018101 (2013), "
 _SPINNING += "doi:10.1088/0031-8949/88/01/018101"
 _FLYING = ("1/s", None, None)
-"""Units: only what flies freely is lifted."""
+"""Units of the lift coefficient; it exists only for bodies in free flight."""
 _EITHER_WAY = ((-1, 1), (0, 0), (0, 0))
-"""Plausible lift, 1/s; spin has two senses."""
+"""Plausible lift in 1/s; spin has two directions."""
 
 
 class Magnus(Force):
@@ -31,6 +31,11 @@ class Magnus(Force):
     )
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Across the velocity, so that it does no work."""
+        """Return the force (L, D), perpendicular to the velocity, so that it does no work.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         (level, upright), (vx, vy, vz) = c[:, :, 0], moment.v.T
         return np.stack([-level * vz - upright * vy, upright * vx, level * vx], axis=1)  # (1)

@@ -1,6 +1,6 @@
-"""What lies between the world and its recording.
+"""Sensor effects: differences between the true values and their recording.
 
-With y what there is, r what is recorded, t the time stamp and c the coefficient:
+With y the true value, r the recorded value, t the time stamp and c the coefficient:
 
 * (1) gain: r = (1 + c) y
 * (2) bias: r = y + c
@@ -9,13 +9,14 @@ With y what there is, r what is recorded, t the time stamp and c the coefficient
 * (5) drift: r(t) = y(t) + c t
 * (6) clock: r(t) = y((1 + c) t)
 * (7) eccentricity: r = y + a sin y + b cos y, y an angle
-* (8) slip: r(t) = y(t) + c from an instant s on, on the clock of the stamps
+* (8) slip: r(t) = y(t) + c from a time s on, on the clock of the stamps
 
-Of a slip between two samples nobody knows when it was: over an interval h before a sample, (8) is
-straight from s = t - h / 2, where it has happened, to s = t + h / 2, where it has not.
+The time of a slip between two samples is unknown: over an interval h before a sample, (8) is linear
+from s = t - h / 2, where it has happened, to s = t + h / 2, where it has not.
 
-Gain, bias, drift, eccentricity and slip act on one channel, the system's first observed; a delay,
-a lag and a skewed clock on all. A negative delay leads; a negative lag is none.
+Gain, bias, drift, eccentricity and slip act on one channel, the system's first observed one; a
+delay, a lag and a skewed clock act on all. A negative delay is a lead; a negative lag counts as
+zero.
 """
 
 from __future__ import annotations
@@ -29,40 +30,41 @@ from sims.system import Coefficient, Sensor, Signal
 _TIME = ("s", "s", "s")
 """Seconds, on every kind of system."""
 _PURE = ("1", "1", "1")
-"""A pure number, on every kind of system."""
+"""Units of a dimensionless coefficient on every kind of system."""
 _FIFTH = ((-0.2, 0.2), (-0.2, 0.2), (-0.2, 0.2))
-"""Plausible gains: a fifth too much or too little."""
+"""Plausible gains: up to a fifth too much or too little."""
 _LEAST_GAIN = -0.8
-"""A sensor shows at least a fifth of the true value: a reading that hardly depends on what is
-measured would agree with any constant signal.
+"""Smallest gain: a sensor shows at least a fifth of the true value.
+
+A reading that hardly depends on the measured quantity would agree with any constant signal.
 """
 _MOST_GAIN = 4.0
-"""And at most five times the true value."""
+"""Largest gain: a sensor shows at most five times the true value."""
 _LENGTH = ("m", "m", "rad")
-"""Units of a reading that is a position; it may be another."""
+"""Units of a reading that is a position; a reading may have another unit."""
 _OFFSET = ((-1, 1), (-0.2, 0.2), (-0.2, 0.2))
 """Plausible biases, in the units of `_LENGTH`."""
 _OFF = Coefficient("coefficient", _LENGTH, _OFFSET, of="reading")
-"""By how much a reading is off."""
+"""Coefficient for a constant error of a reading."""
 _SPEED = ("m/s", "m/s", "rad/s")
 """Units of `_LENGTH`, per second."""
 _DRIFT = ((-0.2, 0.2), (-0.05, 0.05), (-0.1, 0.1))
 """Plausible drifts, in the units of `_SPEED`."""
 _SLOW = ((-0.05, 0.05), (-0.05, 0.05), (-0.05, 0.05))
-"""Plausible errors of a clock, seconds a second."""
+"""Plausible clock errors in seconds per second."""
 _ANGLE = (None, None, "rad")
-"""Of what an encoder of angles shows."""
+"""Units of the reading of an angle encoder."""
 _OFF_AXIS = ((0, 0), (0, 0), (-0.1, 0.1))
-"""Plausible errors of an encoder that is off its axis, in the units of `_ANGLE`."""
+"""Plausible errors of an eccentric encoder, in the units of `_ANGLE`."""
 _INSTANT = ((0.01, 10), (0.01, 10), (0.01, 10))
-"""Plausible instants on a recording's clock, seconds; a fit looks for them as long as runs are."""
+"""Plausible times in seconds on a recording's clock; a fit searches the duration of the runs."""
 _SHORTEST = 1e-12
-"""Seconds; samples this close are one."""
+"""Smallest time in seconds between two different samples."""
 _VOCABULARY = "International Vocabulary of Metrology, JCGM 200:2012"
 
 
 class Gain(Sensor):
-    """The reading times 1 + c."""
+    """Reading times 1 + c."""
 
     name = "sensor.gain"
     noun = "a sensor gain"
@@ -71,12 +73,17 @@ class Gain(Sensor):
     coefficients = (Coefficient("coefficient", _PURE, _FIFTH, least=_LEAST_GAIN, most=_MOST_GAIN),)
 
     def read(self, c: Array, signal: Signal) -> Array:
-        """In proportion."""
+        """Return the scaled reading (L, S).
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         return signal.values * (1.0 + c[0])  # (1)
 
 
 class Bias(Sensor):
-    """The reading plus c."""
+    """Reading plus c."""
 
     name = "sensor.bias"
     noun = "a sensor bias"
@@ -85,12 +92,17 @@ class Bias(Sensor):
     coefficients = (_OFF,)
 
     def read(self, c: Array, signal: Signal) -> Array:
-        """Shifted."""
+        """Return the shifted reading (L, S).
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         return signal.values + c[0]  # (2)
 
 
 class Delay(Sensor):
-    """What was the case c seconds before the time stamp; before the start, the initial state."""
+    """Reading delayed by c seconds; before the start, the initial state."""
 
     name = "sensor.delay"
     noun = "a sensor delay"
@@ -99,28 +111,38 @@ class Delay(Sensor):
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
 
     def times(self, c: Array, t: Array) -> Array:
-        """Earlier instants."""
+        """Return the earlier times (L, S) of the recorded values.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            t: (L, S) times in seconds.
+        """
         return t - c[0]  # (3)
 
 
 class Lag(Sensor):
-    """The reading through a first-order lag with time constant c, settled at its first value."""
+    """Reading through a first-order lag with time constant c, settled at its first value."""
 
     name = "sensor.lag"
     noun = "a sensor lag"
     says = "the sensor follows gradually instead of at once"
     source = _VOCABULARY + ", 4.23"
-    filters = True  # between two samples the reading goes on, so every step counts
+    filters = True  # the lag evolves between samples, so every step is needed
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
 
     def read(self, c: Array, signal: Signal) -> Array:
-        """Exact for a reading that is linear over each step."""
+        """Return the lagged reading (L, S), exact for a reading that is linear over each step.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         # (4); without a lag the reading itself, bit for bit
         return np.where(c[0] > 0, _lagged(signal, c[0]), signal.values)
 
 
 class Drift(Sensor):
-    """The reading plus c for each second since the start of the run."""
+    """Reading plus c for each second since the start of the run."""
 
     name = "sensor.drift"
     noun = "a sensor drift"
@@ -129,12 +151,17 @@ class Drift(Sensor):
     coefficients = (Coefficient("coefficient", _SPEED, _DRIFT, of="reading/s"),)
 
     def read(self, c: Array, signal: Signal) -> Array:
-        """Further off as time goes on."""
+        """Return the reading (L, S) with an error proportional to time.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         return signal.values + c[0] * signal.times  # (5)
 
 
 class Eccentricity(Sensor):
-    """An encoder's disc or magnet that is off its axis: an error that comes once a turn."""
+    """Eccentric disc or magnet of an encoder: an error with the period of one turn."""
 
     name = "sensor.eccentricity"
     noun = "an eccentric encoder"
@@ -144,13 +171,18 @@ class Eccentricity(Sensor):
     coefficients = tuple(Coefficient(of, _ANGLE, _OFF_AXIS) for of in ("sine", "cosine"))
 
     def read(self, c: Array, signal: Signal) -> Array:
-        """As far off as the angle says."""
+        """Return the reading (L, S) with an error periodic in the angle.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         y = signal.values
         return y + c[0] * np.sin(y) + c[1] * np.cos(y)  # (7)
 
 
 class Slip(Sensor):
-    """An encoder that slips once: the reading plus c from an instant on."""
+    """Single slip of an encoder: reading plus c from a point in time on."""
 
     name = "sensor.slip"
     noun = "an encoder that slipped"
@@ -161,12 +193,17 @@ class Slip(Sensor):
     coefficients = (_OFF, Coefficient("instant", _TIME, _INSTANT))
 
     def read(self, c: Array, signal: Signal) -> Array:
-        """As far off as it has slipped."""
+        """Return the reading (L, S) with a constant error after the slip.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         return signal.values + c[0] * _since(c[1], signal.clock + signal.times)  # (8)
 
 
 class Skew(Sensor):
-    """A recorder's clock that is slow by c: 1 + c seconds pass between stamps one second apart."""
+    """Recorder clock that is slow by c: 1 + c seconds pass between stamps one second apart."""
 
     name = "clock.skew"
     noun = "a clock skew"
@@ -176,21 +213,26 @@ class Skew(Sensor):
     coefficients = (Coefficient("coefficient", _PURE, _SLOW),)
 
     def times(self, c: Array, t: Array) -> Array:
-        """Instants on the true clock."""
+        """Return the times (L, S) on the true clock.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            t: (L, S) times in seconds.
+        """
         return t * (1.0 + c[0])  # (6)
 
 
 def _since(instant: Array, now: Array) -> Array:
-    """(L, S) of stamps `now`: 0 before an instant (L, 1), 1 after it, (8) about it."""
+    """Return the progress (L, S) of the slip at stamps `now`: 0 before, 1 after, (8) between."""
     apart = np.maximum(np.diff(now, axis=1, prepend=now[:, :1]), _SHORTEST)
     share: Array = np.clip((now - instant) / apart + 0.5, 0.0, 1.0)
     return share
 
 
 def _lagged(signal: Signal, lag: Array) -> Array:
-    """Ends (L, S) of each step of (4), `lag` (L, 1) in seconds."""
+    """Return the values (L, S) of (4) at the end of each step; `lag` (L, 1) is in seconds."""
     decay, mean = response(signal.steps, lag)
     old = before(signal.values, signal.start)
-    # (4) of sims.effects.lag, all but its first term, which goes from step to step
+    # (4) of sims.effects.lag without its first term, which is the recursion
     gained = signal.values - decay * old - mean * (signal.values - old)
     return recur(decay, gained, signal.start)

@@ -1,17 +1,17 @@
-"""The law of a servo, where it is not the proportional one of its set point.
+"""Servo-law effects: deviations from a proportional law of the set point.
 
 With u the set point, q the position, e = u - q, K the servo's stiffness and c the coefficient, the
-drive exerts besides
+drive exerts in addition
 
-* (1) dead zone: K (dz(e) - e), dz(e) = e - clip(e, -c, c); what limits the drive limits this, too
-* (2) derivative: K (u(t) - u(t - c)): the servo's D term acts on the rate of the error, not of q
-  alone; c is the D gain over the P gain, and the rate is taken over as long, so that of a jump
-  the servo feels a kick of its height and not an impulse
-* (3) profile: what the servo follows is not u but p, which moves to u as fast as |d2p/dt2| <= c
-  lets it and arrives at rest: d2p/dt2 = c sign(u - p - |dp/dt| dp/dt / (2 c)), and none when it is
-  there
+* (1) dead zone: K (dz(e) - e), dz(e) = e - clip(e, -c, c); the limits of the drive apply to it, too
+* (2) derivative: K (u(t) - u(t - c)): the servo's D term acts on the rate of the error, instead of
+  the rate of q alone; c is the D gain divided by the P gain, and the rate is averaged over the
+  time c, so that a step of the set point gives a pulse of its height instead of an impulse
+* (3) profile: the servo follows p instead of u, where p moves to u as fast as |d2p/dt2| <= c
+  permits and arrives at rest: d2p/dt2 = c sign(u - p - |dp/dt| dp/dt / (2 c)), and zero after
+  arrival
 
-A negative width or limit is none.
+A negative width or limit counts as zero.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _WIDTH = ((0, 1), (0, 0.05), (0, 0.2))
 _TIME = ("s", "s", "s")
 """Seconds, on every kind of system."""
 _ACCELERATION = ("m/s^4", "m/s^2", "rad/s^2")
-"""Units of `_USUAL`, per second and second."""
+"""Units of `_USUAL`, per second squared."""
 _REACHED = ((0, 500), (0, 50), (0, 200))
 """Plausible limits of a set point's acceleration, in the units of `_ACCELERATION`."""
 
 
 class Deadband(Force):
-    """No drive while the servo is within c of its set point, that of the excess beyond."""
+    """Dead zone of a servo: no drive within c of the set point, drive from the excess beyond."""
 
     name = "servo.deadband"
     noun = "a dead zone of the servo"
@@ -45,13 +45,18 @@ class Deadband(Force):
     coefficients = (Coefficient("coefficient", _USUAL, _WIDTH, of="error"),)
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """What the drive lacks of the proportional law."""
+        """Return the force (L, D) that is missing in comparison with the proportional law.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         width = np.maximum(c[0], 0.0)
         return moment.aimed(-np.clip(moment.error, -width, width))  # (1)
 
 
 class Derivative(Input):
-    """The set point leads by its own rate times c, as where a D term acts on the error."""
+    """Set point with a lead of c times its rate, as if the D term acts on the error."""
 
     name = "servo.derivative"
     noun = "a D term on the error"
@@ -61,7 +66,12 @@ class Derivative(Input):
     coefficients = (Coefficient("coefficient", _TIME, ((0, 0.2), (0, 0.2), (0, 0.2))),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
-        """What has come in the last c seconds is felt twice."""
+        """Return the set point (L, S) plus its change in the last c seconds.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         lead = np.maximum(c[0], 0.0)
         return np.where(
             lead > 0, 2.0 * signal.values - _earlier(signal, lead), signal.values
@@ -69,7 +79,7 @@ class Derivative(Input):
 
 
 class Profile(Input):
-    """The set point moves to the command with an acceleration of at most c; zero is no limit."""
+    """Motion profile of the set point with acceleration of at most c; zero is no limit."""
 
     name = "servo.profile"
     noun = "a servo's motion profile"
@@ -79,16 +89,21 @@ class Profile(Input):
     coefficients = (Coefficient("coefficient", _ACCELERATION, _REACHED, of="input/s^2"),)
 
     def feel(self, c: Array, signal: Signal) -> Array:
-        """The mean over each step of what is reached at the limit."""
+        """Return the mean (L, S) of the limited set point over each step.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            signal: signal (L, S) over the steps.
+        """
         limit = np.maximum(c[0], 0.0)
         return np.where(limit > 0, _profiled(signal, limit[:, 0]), signal.values)
 
 
 def _profiled(signal: Signal, most: Array) -> Array:
-    """Means (L, S) over each step of (3) with accelerations of at most `most` (L,).
+    """Return means (L, S) of (3) over each step, with accelerations of at most `most` (L,).
 
-    A speed w at the end of a step is chosen such that what is left can be stopped in: w h / 2
-    where one more step of length h will do, w^2 / (2 c) where it takes longer.
+    The speed w at the end of a step is chosen such that the remaining distance is sufficient for
+    stopping: w h / 2 if one more step of length h is enough, w^2 / (2 c) if it takes longer.
     """
     wanted, steps = np.ascontiguousarray(signal.values.T), np.ascontiguousarray(signal.steps.T)
     means = np.empty_like(wanted)
@@ -96,7 +111,7 @@ def _profiled(signal: Signal, most: Array) -> Array:
     inverses = np.divide(1.0, steps, out=np.zeros_like(steps), where=steps > 0)
     rows = zip(wanted, steps, gains, 0.5 * gains, 0.25 * gains**2, inverses, means, strict=True)
     place, speed = signal.start[:, 0].copy(), np.zeros(wanted.shape[1])
-    # Thousands of steps of a few lanes: what can be asked of all steps at once has been.
+    # The loop has thousands of steps of a few elements: everything possible is computed before it.
     for row, h, gain, half, square, inverse, mean in rows:
         apart = row - place
         way = np.copysign(1.0, apart)
@@ -115,15 +130,16 @@ def _profiled(signal: Signal, most: Array) -> Array:
 
 
 def _earlier(signal: Signal, late: Array) -> Array:
-    """Means (L, S) over each step of the signal `late` (L, 1) seconds before; before the run what
-    it began with.
+    """Return means (L, S) over each step of the signal `late` (L, 1) seconds earlier.
+
+    Before the run, the signal has its initial value.
     """
     ends = signal.times
     begins = ends - signal.steps
     gained = np.cumsum(signal.values * signal.steps, axis=1)
     result = signal.values.copy()
     for lane in np.flatnonzero(late[:, 0] > 0):
-        # the integral of the signal, from long before the run
+        # integral of the signal, beginning long before the run
         knots = np.concatenate([[begins[lane, 0] - 1.0, begins[lane, 0]], ends[lane]])
         whole = np.concatenate([[-signal.start[lane, 0], 0.0], gained[lane]])
         first, last = (_integral(knots, whole, t[lane] - late[lane]) for t in (begins, ends))
@@ -134,7 +150,7 @@ def _earlier(signal: Signal, late: Array) -> Array:
 
 
 def _integral(knots: Array, whole: Array, t: Array) -> Array:
-    """The integral at instants, straight on before the first of them."""
+    """Return the integral at times t, extrapolated linearly before the first knot."""
     inside: Array = np.interp(t, knots, whole)
     slope = (whole[1] - whole[0]) / (knots[1] - knots[0])
     return inside + slope * np.minimum(t - knots[0], 0.0)

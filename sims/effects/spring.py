@@ -1,4 +1,4 @@
-"""Springs: forces of the primary coordinate x, towards its zero.
+"""Spring effects: forces on the primary coordinate x, towards its zero.
 
 * (1) linear: F = -c x
 * (2) cubic: F = -c x^3
@@ -13,13 +13,13 @@ _DUFFING = (
     "I. Kovacic, M. J. Brennan (eds.), The Duffing Equation (2011), doi:10.1002/9780470977859"
 )
 _CUBIC = ("1/(m^2*s^2)", "N/m^3", "N*m/rad^3")
-"""Units of a force by a cube of position."""
+"""Units of a force per cube of position."""
 _EITHER_WAY = ((-5, 5), (-50, 50), (-0.5, 0.5))
 """Plausible cubic terms, in the units of `_CUBIC`: springs harden or soften."""
 
 
 class Linear(Force):
-    """A spring that keeps Hooke's law: -c x."""
+    """Linear spring (Hooke's law): -c x."""
 
     name = "spring.linear"
     noun = "a linear spring"
@@ -31,12 +31,17 @@ class Linear(Force):
     )
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Towards zero."""
+        """Return the force (L, D), towards zero.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         return moment.along_primary(-c[0] * moment.primary)  # (1)
 
 
 class Cubic(Force):
-    """The cubic term of a spring that hardens (or softens, c < 0): -c x^3."""
+    """Cubic term of a spring that hardens (or softens, c < 0): -c x^3."""
 
     name = "spring.cubic"
     noun = "a cubic spring"
@@ -46,6 +51,11 @@ class Cubic(Force):
     coefficients = (Coefficient("coefficient", _CUBIC, _EITHER_WAY),)
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Towards zero where c > 0."""
+        """Return the force (L, D), towards zero for c > 0.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         x = moment.primary
         return moment.along_primary(-c[0] * x * x * x)  # (2); a power would be slower

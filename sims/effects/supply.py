@@ -1,26 +1,26 @@
-"""What a drive's supply does to its force.
+"""Power-supply effects: reduction of a drive's force by its supply.
 
-With U the force that the drive would exert and V the voltage of its supply: the drive makes U in
-proportion to V, and draws a current in proportion to the force F that it makes; the supply's own
-resistance takes that much of V away:
+With U the force that the drive would exert and V the voltage of its supply: the drive exerts a
+force proportional to V, and draws a current proportional to its actual force F; the internal
+resistance of the supply reduces V in proportion to the current:
 
 * F = U (1 - c |F|), so that F = U / (1 + c |U|), and U c |U| / (1 + c |U|) is lost        (1)
 
-c is the share of the voltage that a unit of force costs; 1 / c is a force that is never reached. A
-negative share is none. Where several drives share the supply all of their forces count:
+c is the fraction of the voltage lost per unit of force; 1 / c is a force that is never reached. A
+negative coefficient counts as zero. If several drives share the supply, all their forces count:
 
 * F_i = U_i (1 - c S), S = |F_1| + |F_2| + ..., so that S = D / (1 + c D), D = |U_1| + |U_2| + ...,
   and U_i c D / (1 + c D) is lost                                                        (2)
 
-The current is that of a drive at standstill: what its own motion induces is not in it.
+The current is that of a drive at standstill: the back electromotive force is not included.
 
-A drive that brakes takes energy out of the motion, and needs somewhere to put it: a bridge that
-does not reverse, a supply that takes nothing back or a limit of the braking current leaves of a
-force against the motion a share only. With v the velocity and c the share that is lost:
+A drive that brakes takes energy out of the motion, and needs a sink for it. A bridge that does not
+reverse, a supply that cannot absorb energy, or a limit of the braking current reduces a force
+against the motion to a fraction. With v the velocity and c the fraction that is lost:
 
 * F = U where U v >= 0, and (1 - c) U where U v < 0                                       (3)
 
-At c = 1 the drive speeds up and never slows down; less than none and more than all there is not.
+At c = 1 the drive accelerates and never brakes; c is limited to the range from 0 to 1.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from sims.base import Array
 from sims.system import Coefficient, Force, Moment
 
 _SHARE = ((0, 0), (0, 0.2), (0, 2))
-"""Plausible shares of the voltage by force, in 1/N and 1/(N m)."""
+"""Plausible voltage losses per unit of force, in 1/N and 1/(N m)."""
 _LOST = ((0, 0), (0, 1), (0, 1))
-"""Plausible shares of a braking force that are lost."""
+"""Plausible lost fractions of a braking force."""
 
 
 class Sag(Force):
-    """The drive falls short of its force by what current takes of the supply's voltage."""
+    """Reduction of the drive's force by the voltage drop of the supply."""
 
     name = "supply.sag"
     noun = "a supply that sags"
@@ -48,14 +48,19 @@ class Sag(Force):
     coefficients = (Coefficient("coefficient", (None, "1/N", "1/(N*m)"), _SHARE),)
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Against the drive."""
+        """Return the force (L, D), opposite to the drive.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         drive, _ = moment.sides
         lost = np.maximum(c[0], 0.0) * moment.drawn
         return moment.along_primary(-drive * lost / (1.0 + lost))  # (1), (2)
 
 
 class Braking(Force):
-    """The drive falls short of its force where that is against the motion."""
+    """Reduction of the drive's force where it acts against the motion."""
 
     name = "supply.braking"
     noun = "a drive that hardly brakes"
@@ -66,7 +71,12 @@ class Braking(Force):
     coefficients = (Coefficient("coefficient", (None, "1", "1"), _LOST),)
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Along the motion."""
+        """Return the force (L, D), in the direction of motion.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of L batch elements.
+        """
         drive, _ = moment.sides
         against = np.where(drive * moment.primary_rate < 0.0, drive, 0.0)
         return moment.along_primary(-np.clip(c[0], 0.0, 1.0) * against)  # (3)

@@ -1,5 +1,6 @@
-"""The table of the project's own effects in this folder's README: ``python -m sims.effects.table``
-prints it.
+"""Generate the table of the project's own effects for the README of this folder.
+
+The command ``python -m sims.effects.table`` prints it.
 """
 
 from __future__ import annotations
@@ -11,14 +12,16 @@ from sims.system import KINDS, Coefficient, Effect
 
 
 def table() -> str:
-    """The table, in Markdown: an effect's sentence, then a row for each coefficient with its
-    plausible ranges.
+    """Return the table in Markdown.
+
+    For each effect it contains the description, and a row for each coefficient with its plausible
+    ranges.
     """
     head = "| effect, hook | coefficient | " + " | ".join(KINDS) + " |"
     rows = [head, "|---|---|---|---|---|"]
     for name in effects.names():
         effect = effects.get(name)
-        # installed plugins' effects come by the same entry points and have pages of their own
+        # effects of installed plugins use the same entry points and have their own documentation
         if effect.__module__.startswith("sims.effects."):
             rows += _rows(effect)
     return "\n".join(rows) + "\n"
@@ -30,7 +33,7 @@ def _rows(effect: type[Effect]) -> list[str]:
     for c in effect.coefficients:
         ranges = [_range(c, place) for place in range(len(KINDS))]
         rows.append(f"| {head} | {c.name} | " + " | ".join(ranges) + " |")
-        head = ""  # further coefficients stand below the first
+        head = ""  # the description is only in the row of the first coefficient
     return rows
 
 

@@ -1,18 +1,17 @@
-"""Numbers that a robot's model file states, and that may be wrong.
+"""Errors of numbers that a robot's model file specifies.
 
-They act on what the file states, as a share c of it or as a difference, so that a coefficient of
-zero is the file's own number:
+The coefficients are relative errors c or differences, so that zero is the number in the file:
 
-* (1) mass: m (1 + c) and the inertia tensor with it, the centre of mass where it was
-* (2) centre of mass: moved by (x, y, z) in the body's frame, mass and inertia about it kept
+* (1) mass: m (1 + c), and the inertia tensor with it; the centre of mass does not change
+* (2) centre of mass: moved by (x, y, z) in the body's frame; mass and inertia about it are constant
 * (3) inertia: the tensor alone times (1 + c)
-* (4) armature: the inertia of the rotor, as the joint feels it, plus c
+* (4) armature: the inertia of the rotor at the joint plus c
 * (5) stiffness: the servo's kp (1 + c)
 * (6) damping: the servo's kv (1 + c)
-* (7) limit: the actuator's force cut off at c either way; a limit of zero is the file's own
+* (7) limit: the actuator's force limited to c in both directions; zero is the limit of the file
 
-A mass stays positive and an inertia tensor one that a body can have, by what c may be: a tensor
-times a positive number keeps the triangle inequality of its moments.
+The range of c keeps masses positive and inertia tensors physical: a tensor times a positive number
+keeps the triangle inequality of its moments.
 """
 
 from __future__ import annotations
@@ -20,19 +19,19 @@ from __future__ import annotations
 from sims.system import Coefficient, Value
 
 _PURE = ("1", "1", "1")
-"""A pure number, on every kind of system."""
+"""Units of a dimensionless coefficient on every kind of system."""
 _HALF = ((-0.5, 0.5), (-0.5, 0.5), (-0.5, 0.5))
-"""Plausible shares: half as much more or less."""
+"""Plausible relative errors: up to 50 % more or less."""
 _LENGTH = ("m", "m", "m")
 _TENTH = ((-0.1, 0.1), (-0.1, 0.1), (-0.1, 0.1))
-"""Plausible offsets of a centre of mass, metres."""
+"""Plausible offsets of a centre of mass in metres."""
 _IDENTIFICATION = "W. Khalil, E. Dombre, Modeling, Identification and Control of Robots (2002)"
 _LEAST = -0.99
-"""The least share that leaves something of a number that must be positive."""
+"""Smallest relative error of a number that must stay positive."""
 
 
 class Mass(Value):
-    """The mass and, with it, the inertia of a body times 1 + c."""
+    """Mass and, with it, inertia of a body times 1 + c."""
 
     name = "mass.scale"
     noun = "a wrong mass"
@@ -43,7 +42,7 @@ class Mass(Value):
 
 
 class Offset(Value):
-    """The centre of mass of a body moved by x, y and z in its own frame."""
+    """Centre of mass of a body moved by x, y and z in its own frame."""
 
     name = "mass.offset"
     noun = "a misplaced centre of mass"
@@ -54,7 +53,7 @@ class Offset(Value):
 
 
 class Inertia(Value):
-    """The inertia tensor of a body times 1 + c."""
+    """Inertia tensor of a body times 1 + c."""
 
     name = "inertia.scale"
     noun = "a wrong inertia"
@@ -65,7 +64,7 @@ class Inertia(Value):
 
 
 class Armature(Value):
-    """The inertia of the rotor that the joint feels, plus c."""
+    """Inertia of the rotor at the joint, plus c."""
 
     name = "inertia.armature"
     noun = "a wrong armature"
@@ -78,7 +77,7 @@ class Armature(Value):
 
 
 class Stiffness(Value):
-    """The servo's proportional gain times 1 + c."""
+    """Proportional gain of the servo times 1 + c."""
 
     name = "actuator.stiffness"
     noun = "a wrong servo stiffness"
@@ -89,7 +88,7 @@ class Stiffness(Value):
 
 
 class Damping(Value):
-    """The servo's gain on velocity times 1 + c."""
+    """Velocity gain of the servo times 1 + c."""
 
     name = "actuator.damping"
     noun = "a wrong servo damping"
@@ -100,7 +99,7 @@ class Damping(Value):
 
 
 class Limit(Value):
-    """The actuator's force cut off at c either way; zero is the file's own limit."""
+    """Force of the actuator limited to c in both directions; zero is the limit of the file."""
 
     name = "actuator.limit"
     noun = "a limit of the actuator's force"

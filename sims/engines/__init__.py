@@ -1,4 +1,4 @@
-"""Engines that integrate systems, by name."""
+"""Look up simulation engines by name."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ NAMES = {
     "mujoco": "sims.engines.mujoco",
     "pybullet": "sims.engines.bullet",
 }
-"""Modules of the engines; one is imported when it is asked for, and says what it requires."""
+"""Module of each engine by name; a module is imported when its engine is first requested."""
 HIDING = ("batch",)
-"""Engines that integrate hidden coordinates beside a system's own (`sims.engines.hidden`)."""
+"""Engines that can integrate the hidden states of effects (`sims.engines.hidden`)."""
 
 
 def stepping() -> str:
-    """How the engine `batch` steps here, for a record: ``machine code``, ``numpy``, or ``none``
-    where it is not in use.
+    """Return how the engine `batch` steps in this process, for a record of the run.
 
-    Machine code is made if it is not there, once after an install; so ask before there are
-    processes that would each wait for it.
+    If the machine code does not exist yet, it is compiled, once after an installation. Therefore
+    call this before starting processes that would each wait for it.
+
+    Returns:
+        ``machine code``, ``numpy``, or ``none`` if the engine is not in use.
     """
     if NAMES["batch"] not in sys.modules:
         return "none"
@@ -37,17 +39,27 @@ def stepping() -> str:
 
 
 def missing_packages(name: str) -> list[str]:
-    """Packages that an engine of `NAMES` requires and that are not installed."""
+    """Return the packages that an engine of `NAMES` requires and that are not installed."""
     required = import_module(NAMES[name]).REQUIRES
     return [package for package in required if importlib.util.find_spec(package) is None]
 
 
 def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -> Engine:
-    """A new engine for one simulator; its module's `engine(system, **settings)` makes it.
+    """Make a new engine for one simulator.
+
+    The function `engine(system, **settings)` of the engine's module makes it.
+
+    Args:
+        name: name of the engine in `NAMES`.
+        system: system that the engine will integrate.
+        settings: the engine's settings by name.
+
+    Returns:
+        The engine.
 
     Raises:
-        InputError: no such engine, a package it needs is missing, a setting it does not have, or it
-            cannot carry the system.
+        InputError: the engine or a setting is unknown, a required package is not installed, or the
+            engine cannot integrate the system.
     """
     if name not in NAMES:
         raise unknown("engine", name, list(NAMES))
@@ -57,7 +69,8 @@ def engine_named(name: str, system: type[System], settings: Mapping[str, Any]) -
             f"engine {name} needs {', '.join(missing)}, not installed"
             f" (pip install {' '.join(missing)})"
         )
-    # An engine's settings are the keyword arguments of what makes it: they are declared once.
+    # An engine's settings are the keyword-only arguments of its factory, so that they are declared
+    # once.
     parameters = inspect.signature(module.engine).parameters
     known = [key for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY]
     for setting in settings:

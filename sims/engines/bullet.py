@@ -1,8 +1,7 @@
-"""Bullet as an engine: forces through its torque and force interfaces, impacts through its contact
-solver.
+"""PyBullet engine: forces through Bullet's force and torque interfaces, impacts by its solver.
 
-The world that carries a system is built by the module ``bullet_world`` beside the system's own;
-`sims.engines.worlds` states what such a module must have.
+The module ``bullet_world`` in the system's package builds the world of a system; its interface is
+specified in `sims.engines.worlds`.
 """
 
 from __future__ import annotations
@@ -28,15 +27,15 @@ from sims.system import Engine, Lanes, Motion, System
 REQUIRES = ("pybullet",)
 
 _PUBLISHED = {"linear_damping": 0.04, "lateral_friction": 0.2, "plane_restitution": 1.0}
-"""Settings of the published scene (TuneNet, arXiv 1907.11200): 1/s, and pure numbers."""
+"""Settings of the published scene (TuneNet, arXiv 1907.11200): 1/s, and dimensionless numbers."""
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-"""A body that is not turned, as a quaternion x, y, z, w."""
+"""Identity rotation as a quaternion x, y, z, w."""
 _NOWHERE = (0.0, 0.0, 0.0)
-"""The origin, or no velocity at all."""
+"""Zero vector: the origin, or zero velocity."""
 _IMPACT = 1e-4
-"""Seconds that the step of an impact lasts."""
+"""Length of the time step of an impact, in seconds."""
 _REACH = 0.02 * math.sqrt(3)
-"""Radii above the ground at which Bullet's contact begins."""
+"""Height above the ground, in radii of the ball, at which Bullet's contact begins."""
 
 
 def engine(
@@ -48,23 +47,26 @@ def engine(
     lateral_friction: float | None = None,
     plane_restitution: float | None = None,
 ) -> Engine:
-    """The engine for one simulator.
+    """Make the PyBullet engine for one simulator.
 
     Args:
-        system: what it will integrate.
+        system: system that the engine will integrate.
         time_step: longest step in seconds; each sampling interval is divided into equal steps not
             longer than this.
-        native_contact: for a system that bounces: Bullet as it comes (`sims.ball.bullet_native`),
-            stepped and read at first order as the published experiments do, without `time_step` in
-            one step a sample.
-        linear_damping: with `native_contact`: what Bullet takes for air, 1/s (0.04).
+        native_contact: for a bouncing system: use Bullet's native contact
+            (`sims.ball.bullet_world`), stepped and read at first order as in the published
+            experiments; without `time_step`, each sample interval is one step.
+        linear_damping: with `native_contact`: Bullet's linear air damping in 1/s (0.04).
         lateral_friction: with `native_contact`: friction of both ball and ground (0.2); the contact
-            has the product.
-        plane_restitution: with `native_contact`: the ground's restitution (1.0); the contact has
+            uses the product.
+        plane_restitution: with `native_contact`: restitution of the ground (1.0); the contact uses
             the product.
 
+    Returns:
+        The engine.
+
     Raises:
-        InputError: an impossible setting.
+        InputError: a setting is not valid.
     """
     own = {
         "linear_damping": linear_damping,
@@ -89,8 +91,10 @@ def engine(
 
 
 class BulletEngine:
-    """Bullet: lanes one after the other in one world, or several bodies in one where effects are
-    asked.
+    """PyBullet engine for one system.
+
+    Batch elements are integrated one after the other in one world; where effects must be evaluated
+    at each step, several bodies may share one world.
     """
 
     name: str = "pybullet"
@@ -126,22 +130,22 @@ class BulletEngine:
             self._rollouts = partial(together.rollouts, alone, company, self._world.discard)
 
     def integrate(self, lanes: Lanes) -> Motion:
-        """See `Engine`."""
+        """Integrate all batch elements; see `Engine`."""
         assert self._rollouts is not None, "a system that the engine refuses"
         return integrate(lanes, self._rollouts, self._discard)
 
     def _discard(self) -> None:
-        """Build afresh before the next rollout."""
+        """Discard the worlds, so that the next rollout builds new ones."""
         self._world.discard()
         if self._many is not None:
             self._many.discard()
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
-        """See `Engine`."""
+        """Return why the engine cannot integrate the system; see `Engine`."""
         return self._reason
 
     def close(self) -> None:
-        """Give back the Bullet world; the next integration opens a new one."""
+        """Close the Bullet worlds; the next integration opens new ones."""
         if self._rollouts is not None:
             self._world.close()
         if self._many is not None:
@@ -149,7 +153,7 @@ class BulletEngine:
 
 
 class _Mover:
-    """A free ball; see `sims.engines.flight.Mover`."""
+    """Free ball; see `sims.engines.flight.Mover`."""
 
     def __init__(self, world: bullet.PersistentWorld) -> None:
         self._world = world
@@ -159,31 +163,31 @@ class _Mover:
         self._x: Vector = _NOWHERE
 
     def start(self, constants: dict[str, float]) -> None:
-        """A world for these constants, without the contact points of the rollout before."""
+        """Prepare a world for these constants, without contact points of the previous rollout."""
         p = bullet.engine()
         self._mass = constants["mass"]
         self._contact = (math.nan, math.nan)
         self._client, self._body = self._world.body(constants)
-        # The world is reset in place: building one is half the cost of a rollout. But contact
-        # points outlive a reset and would be taken for old, which changes what follows by
-        # rounding. They are dropped where the ball touches nothing.
+        # The world is reset in place, because building one is half the cost of a rollout. But
+        # contact points survive a reset, and Bullet would use them as old contacts, which changes
+        # the results by rounding. They are removed by placing the ball where it touches nothing.
         far = 0.0, 0.0, 2.0 * constants["radius"] + 1.0
         p.resetBasePositionAndOrientation(self._body, far, _UPRIGHT, self._client)
         p.performCollisionDetection(self._client)
 
     def pace(self, step: float) -> None:
-        """Step in seconds."""
+        """Set the step in seconds."""
         bullet.engine().setTimeStep(step, self._client)
 
     def place(self, x: Vector, w: Vector) -> None:
-        """Position and velocity; upright and without spin."""
+        """Set position and velocity; the ball is upright and does not spin."""
         bullet.engine().resetBasePositionAndOrientation(self._body, x, _UPRIGHT, self._client)
         bullet.engine().resetBaseVelocity(self._body, w, _NOWHERE, self._client)
         self._x = x
 
     def advance(self, force: Vector) -> State:
-        """One step with a force at the centre, which is where it was last placed or read."""
-        # Forces come per unit mass, Bullet wants newtons and where they attack.
+        """Advance by one step with a force per unit mass at the ball's last known centre."""
+        # Bullet expects the force in newtons and the point where it acts.
         p = bullet.engine()
         mass = self._mass
         newtons = mass * force[0], mass * force[1], mass * force[2]
@@ -191,7 +195,7 @@ class _Mover:
         return self.glide((1,))[0]
 
     def glide(self, counts: Sequence[int]) -> list[State]:
-        """Steps under gravity."""
+        """Advance by each number of steps in `counts` under gravity alone; return the states."""
         p = bullet.engine()
         client = self._client
         body = self._body
@@ -207,7 +211,7 @@ class _Mover:
         return states
 
     def touch(self, restitution: float, friction: float) -> None:
-        """The ball's restitution and friction."""
+        """Set the ball's restitution and friction coefficient."""
         if (restitution, friction) != self._contact:
             self._contact = restitution, friction
             bullet.engine().changeDynamics(
@@ -220,30 +224,38 @@ class _Mover:
 
 
 class BulletBall(_Mover):
-    """A ball that does not spin, on ground of restitution and friction 1; see
-    `sims.engines.flight.FlyingBall`.
+    """Ball without spin, on ground with restitution and friction 1.
+
+    See `sims.engines.flight.FlyingBall`.
     """
 
     def start(self, constants: dict[str, float]) -> None:
-        """As every ball's, without contact."""
+        """Prepare a world for these constants, with contact switched off."""
         self._floor = constants["radius"]
         self._gravity = constants["gravity"]
         super().start(constants)
         self._meets(False)
 
     def _meets(self, ground: bool) -> None:
-        """Let contact act or not."""
-        # In flight contact is off: where the ground is met is found by the flight itself.
+        """Switch contact between ball and ground on or off."""
+        # Contact is off in flight, because `flight` computes when the ball meets the ground.
         p = bullet.engine()
         floor = p.getBodyUniqueId(0, self._client)
         p.setCollisionFilterPair(floor, self._body, -1, -1, ground, self._client)
 
     def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
-        """Bullet's contact solver on one short step, gravity made up for."""
+        """Return the velocity after an impact, from Bullet's contact solver in one short step.
+
+        Args:
+            x: position at the impact.
+            v: velocity before the impact.
+            restitution: restitution coefficient.
+            friction: friction coefficient.
+        """
         self.touch(restitution, friction)
         self.pace(_IMPACT)
-        # Bullet adds gravity's share of the step before it solves the contact: what it then finds
-        # is v.
+        # Bullet adds gravity's velocity change of the step before it solves the contact. This is
+        # compensated, so that the solver sees v.
         inside = x[0], x[1], self._floor - flight.INSIDE
         self.place(inside, (v[0], v[1], v[2] + self._gravity * _IMPACT))
         self._meets(True)
@@ -252,13 +264,13 @@ class BulletBall(_Mover):
         return after
 
     def hold(self) -> None:
-        """Neither restitution nor friction."""
+        """Set contact with zero restitution and zero friction."""
         self.touch(0.0, 0.0)
         self._meets(True)
 
 
 class NativeBall(_Mover):
-    """Bullet's own ball; see `sims.engines.native.NativeBall`."""
+    """Ball with Bullet's native contact; see `sims.engines.native.NativeBall`."""
 
     def __init__(self, world: bullet.PersistentWorld, settings: Mapping[str, float]) -> None:
         super().__init__(world)
@@ -267,18 +279,20 @@ class NativeBall(_Mover):
         self._reach = math.nan
 
     def start(self, constants: dict[str, float]) -> None:
-        """As every ball's."""
+        """Prepare a world for these constants."""
         super().start(constants)
         self._reach = _REACH * constants["radius"]
 
     def touch(self, restitution: float, friction: float) -> None:
-        """The ball's restitution; friction beside that of the settings, of which the contact has
-        the product of two.
+        """Set the ball's restitution and the friction of the contact.
+
+        `friction` is added to that of the settings, which is the product of both bodies'
+        coefficients.
         """
         if (restitution, friction) == self._contact:
             return
-        # The contact has the product of both bodies' frictions: with the ground's 1, the ball's own
-        # is the sum of what the settings' product was and what the effect adds.
+        # The contact uses the product of both bodies' friction. With 1 for the ground, the ball's
+        # coefficient is the product from the settings plus the friction of the effect.
         own = self._rough
         ground = self._rough
         if friction:
@@ -293,5 +307,5 @@ class NativeBall(_Mover):
         self._contact = restitution, friction
 
     def near(self, gap: float) -> bool:
-        """Within Bullet's reach."""
+        """Return whether the gap is within Bullet's contact distance."""
         return gap <= self._reach

@@ -1,7 +1,7 @@
-"""Bodies on joints in Bullet, several in one world, where nothing in it can touch.
+"""Bodies on joints in PyBullet: one at a time, or several in one world without contact.
 
-Bullet takes little less for several bodies than for one at a time; what is gained is that effects
-are asked once a step for all of them.
+Bullet needs little less time for several bodies than for one after another. The gain is that
+effects are evaluated once per step for all of them.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from sims.engines.worlds import BulletJointModule
 
 FEWEST: dict[str, int] = {"asked": 8}
 MOST = 16
-"""Bodies in one world: of more, each takes Bullet longer."""
+"""Maximum number of bodies in one world: with more, Bullet needs more time for each."""
 
 
 class Joint:
-    """A body on one hinge or guide; see `sims.engines.joint.Joint`."""
+    """Body on one hinge or guide; see `sims.engines.joint.Joint`."""
 
     def __init__(self, world: bullet.PersistentWorld, module: BulletJointModule) -> None:
         self._world = world
@@ -31,12 +31,12 @@ class Joint:
         self.open_loop: bool = module.OPEN_LOOP
 
     def start(self, constants: dict[str, float]) -> None:
-        """A world for these constants; all else that matters is set by `pace` and `place`."""
+        """Prepare a world for these constants; `pace` and `place` set everything else."""
         self._constants, self.gravity = constants, self._gravity(constants)
         self._client, self._body = self._world.body(constants)
 
     def pace(self, step: float, inertia: float, damping: float) -> bool:
-        """Step in seconds, generalised inertia, joint damping."""
+        """Set step (s), inertia and damping; return False if Bullet cannot represent them."""
         p = bullet.engine()
         if not self._load(self._client, self._body, inertia, self._constants):
             return False
@@ -45,19 +45,23 @@ class Joint:
         return True
 
     def place(self, x: float, w: float) -> None:
-        """The joint's position and velocity."""
+        """Set the joint's position and velocity."""
         bullet.engine().resetJointState(self._body, 0, x, w, self._client)
 
     def advance(self, force: float) -> tuple[float, float]:
-        """One step."""
+        """Advance by one step; return position and velocity."""
         return self.glide(force, (1,))[0]
 
     def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
-        """Steps with a force or torque at the joint."""
+        """Advance by each number of steps in `counts` with a constant force or torque at the joint.
+
+        Returns:
+            Position and velocity after each count.
+        """
         p = bullet.engine()
         client = self._client
         body = self._body
-        # Looked up once: a rollout has thousands of each.
+        # The attributes are looked up once, because a rollout has thousands of steps.
         step = p.stepSimulation
         push = p.setJointMotorControl2
         torque = p.TORQUE_CONTROL
@@ -65,7 +69,7 @@ class Joint:
         states = []
         for count in counts:
             for _ in range(count):
-                if force:  # Bullet forgets applied torques after each step
+                if force:  # Bullet resets applied torques after each step
                     push(body, 0, torque, force=force, physicsClientId=client)
                 step(client)
             states.append(read(body, 0, client)[:2])
@@ -78,7 +82,7 @@ class Joint:
 class Joints:
     """Bodies on one hinge or guide each; see `sims.engines.joints.Joints`.
 
-    Lanes of one world make the same steps.
+    All elements of one world have the same steps.
     """
 
     fewest: Mapping[str, int] = FEWEST
@@ -93,7 +97,7 @@ class Joints:
         self.open_loop: bool = module.OPEN_LOOP
 
     def start(self, constants: dict[str, float], count: int) -> None:
-        """A world for these constants; all else that matters is set by `pace` and `place`."""
+        """Prepare a world for these constants; `pace` and `place` set everything else."""
         self._constants = constants
         self._weigh = self._gravity(constants)
         if count != self._several.wanted:
@@ -105,11 +109,11 @@ class Joints:
         self._w = np.zeros(count)
 
     def gravity(self, x: Array) -> Array:
-        """See `sims.engines.joints.Joints`."""
+        """Return the generalised force of gravity (n,) at positions (n,)."""
         return np.array([self._weigh(value) for value in x.tolist()])
 
     def pace(self, lanes: Places, step: Array, inertia: Array, damping: Array) -> Mask:
-        """See `sims.engines.joints.Joints`."""
+        """Set step, inertia and damping of some elements; see `sims.engines.joints.Joints`."""
         p = bullet.engine()
         p.setTimeStep(float(step[0]), self._client)
         able = np.ones(lanes.size, dtype=bool)
@@ -122,7 +126,7 @@ class Joints:
         return able
 
     def place(self, lanes: Places, x: Array, w: Array) -> None:
-        """See `sims.engines.joints.Joints`."""
+        """Set position and velocity of some elements; see `sims.engines.joints.Joints`."""
         reset = bullet.engine().resetJointState
         self._x[lanes] = x
         self._w[lanes] = w
@@ -130,25 +134,25 @@ class Joints:
             reset(self._bodies[lane], 0, float(x[place]), float(w[place]), self._client)
 
     def state(self, count: int) -> tuple[Array, Array]:
-        """See `sims.engines.joints.Joints`."""
+        """Return states of the first elements; see `sims.engines.joints.Joints`."""
         return self._x[:count], self._w[:count]
 
     def advance(self, force: Array) -> None:
-        """See `sims.engines.joints.Joints`."""
+        """Advance all elements by one step; see `sims.engines.joints.Joints`."""
         p = bullet.engine()
         client = self._client
         push = p.setJointMotorControl2
         torque = p.TORQUE_CONTROL
         read = p.getJointState
         for body, value in zip(self._bodies, force.tolist(), strict=True):
-            if value:  # Bullet forgets applied torques after each step
+            if value:  # Bullet resets applied torques after each step
                 push(body, 0, torque, force=value, physicsClientId=client)
         p.stepSimulation(client)
         states = [read(body, 0, client)[:2] for body in self._bodies]
         self._x[:], self._w[:] = np.array(states).T
 
     def run(self, force: Array) -> tuple[Array, Array]:
-        """See `sims.engines.joints.Joints`."""
+        """Advance all elements by several steps; see `sims.engines.joints.Joints`."""
         x = np.empty(force.shape)
         w = np.empty(force.shape)
         for k in range(force.shape[1]):
@@ -158,18 +162,18 @@ class Joints:
         return x, w
 
     def again(self, failed: Mask) -> Mask:
-        """See `sims.engines.joints.Joints`."""
-        # A body that has failed may have left the world of the others in any state.
+        """Return which elements must be integrated again; see `sims.engines.joints.Joints`."""
+        # A failed body may have left the shared world in any state.
         if failed.any():
             self._world.discard()
         return np.full(failed.size, failed.any())
 
     def discard(self) -> None:
-        """Build afresh before the next integration."""
+        """Discard the world, so that the next integration builds a new one."""
         self._world.discard()
 
     def close(self) -> None:
-        """Give back the world."""
+        """Close the world."""
         self._world.close()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -178,11 +182,11 @@ class Joints:
 
 
 class _Several:
-    """Builds several bodies in one world.
+    """Builder of several equal bodies in one world.
 
     Attributes:
-        wanted: how many to build.
-        bodies: their ids, when built.
+        wanted: number of bodies to build.
+        bodies: ids of the bodies after `build`.
     """
 
     def __init__(self, build: Callable[[int, Mapping[str, float]], int]) -> None:
@@ -191,10 +195,17 @@ class _Several:
         self.bodies: list[int] = []
 
     def build(self, client: int, constants: Mapping[str, float]) -> int:
-        """Build them in an empty world; returns the first one's id.
+        """Build the bodies in an empty world.
+
+        Args:
+            client: Bullet client of the world.
+            constants: constants of the system by name.
+
+        Returns:
+            The id of the first body.
 
         Raises:
-            ApartError: they might meet.
+            ApartError: the bodies might collide.
         """
         p = bullet.engine()
         first = self._build(client, constants)
@@ -203,7 +214,7 @@ class _Several:
         if shaped or p.getNumBodies(client) > 1 or p.getNumConstraints(client):
             raise ApartError("bodies of this world may meet")
         self.bodies = [first, *(self._build(client, constants) for _ in range(self.wanted - 1))]
-        # Bodies without a shape cannot meet, but Bullet would look at every pair of them.
+        # Bodies without a shape cannot collide, but Bullet would still check every pair of them.
         for body in self.bodies:
             for link in links:
                 p.setCollisionFilterGroupMask(body, link, 0, 0, physicsClientId=client)

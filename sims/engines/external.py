@@ -1,22 +1,23 @@
-"""What the engines share that step one body at a time: lane after lane, forces put in through the
-engine's interface.
+"""Shared integration of batch elements by an external engine, one body at a time.
 
-Bullet and MuJoCo (with its Euler integrator) step alike, by semi-implicit Euler: with step h,
+Forces are applied through the engine's interface.
+
+Bullet and MuJoCo (with its Euler integrator) both step with semi-implicit Euler: with step h,
 
     w' = w + h (G(x) + F) / M                                              (1)
     x' = x + h w'                                                          (2)
 
-where G is the gravity that the engine itself applies and F is what is put in from outside. That is
-of first order if w is read as the velocity at the time of x, and of second if it is read as the one
-half a step before (leapfrog; Hairer, Lubich, Wanner, Acta Numerica 12, 2003,
-doi:10.1017/S0962492902000144), with a(x) the acceleration there:
+where G is the gravity that the engine itself applies and F is the force applied from outside. This
+is of first order if w is read as the velocity at the time of x, and of second order if it is read
+as the velocity half a step earlier (leapfrog; Hairer, Lubich, Wanner, Acta Numerica 12, 2003,
+doi:10.1017/S0962492902000144), with a(x) the acceleration at x:
 
     w = v - h/2 a(x)                                                       (3)
 
-`sims.engines.joint` and `sims.engines.flight` read it so: they choose F such that the engine's
-velocity ends where half a step's force takes the velocity at x.
+`sims.engines.joint` and `sims.engines.flight` read it in this way: they choose F such that the
+engine's velocity becomes the velocity at x plus half a step of acceleration.
 
-What acts beside the engine is asked for by `sims.engines.forces`.
+`sims.engines.forces` evaluates the forces that the engine does not apply itself.
 """
 
 from __future__ import annotations
@@ -33,33 +34,36 @@ from sims.limits import cut, is_number
 from sims.system import Acting, Contact, Effect, Lanes, Moment, Motion, System
 
 TIME_TOLERANCE = 1e-6
-"""Share of an interval by which sample times may miss the engine's steps: recordings round their
-time stamps."""
+"""Largest deviation of sample times from the engine's steps, as a fraction of an interval.
+
+Recordings round their time stamps.
+"""
 
 DEFAULT_STEPS = {"point": 1 / 120, "linear": 2.5e-3, "rotary": 2.5e-3}
-"""Longest step in seconds where the user sets none, by the system's kind."""
+"""Default longest step in seconds, by the system's kind."""
 
 Places = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 Path = tuple[Array, Array, Array]
-"""Positions, velocities, accelerations of one lane, (N, D)."""
+"""Trajectory of one batch element: positions, velocities and accelerations, each (N, D)."""
 
 
 @dataclass(frozen=True)
 class Lane:
-    """One lane's work. Effects whose coefficients are all zero are left out: off is off.
+    """Work for one batch element; effects whose coefficients are all zero are left out.
 
     Attributes:
-        system: what to integrate.
-        theta: (1, p) the system's parameters.
-        constants: (1, 1) by name; `numbers` has them as numbers.
+        system: system to integrate.
+        theta: (1, p) parameters of the system.
+        constants: (1, 1) constants by name; `numbers` returns them as floats.
         x: (D,) initial position.
         v: (D,) initial velocity.
-        steps: (S,) seconds, all > 0: where a lane waits is left out.
-        inputs: (S,) by name, at least one value.
-        effects: those that act, with coefficients (K, 1, 1).
-        declared: all effects of the call in their order, also those that act on other lanes alone.
-        kept: (N,) increasing numbers of steps, from 0, after which the state is kept.
+        steps: (S,) step sizes in seconds, all > 0; steps of zero length are left out.
+        inputs: (S,) inputs by name, at least one value.
+        effects: active effects with coefficients (K, 1, 1).
+        declared: all effects of the call in their order, including those active only on other
+            elements.
+        kept: (N,) increasing step counts, beginning with 0, after which the state is recorded.
     """
 
     system: System
@@ -75,16 +79,26 @@ class Lane:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """The constants as plain numbers."""
+        """Constants as floats, by name."""
         return {name: float(value[0, 0]) for name, value in self.constants.items()}
 
     @property
     def contacts(self) -> list[tuple[Contact, Array]]:
-        """Effects on impacts."""
+        """Contact effects of the element with their coefficients."""
         return [(effect, c) for effect, c in self.effects if isinstance(effect, Contact)]
 
     def moment(self, t: Array, x: Array, v: Array, inputs: Mapping[str, Array]) -> Moment:
-        """Instants of this lane: t (n, 1), x and v (n, D), inputs (n, 1)."""
+        """Make a snapshot of n states of this element.
+
+        Args:
+            t: (n, 1) times in seconds.
+            x: (n, D) positions.
+            v: (n, D) velocities.
+            inputs: (n, 1) inputs by name.
+
+        Returns:
+            The snapshot.
+        """
         n = len(x)
         known = {name: np.repeat(value, n, axis=0) for name, value in self.constants.items()}
         theta = np.repeat(self.theta, n, axis=0)
@@ -92,23 +106,26 @@ class Lane:
 
 
 class ApartError(Exception):
-    """Lanes cannot be integrated together."""
+    """The batch elements cannot be integrated together."""
 
 
 Rollouts = Callable[[Sequence[Lane]], Iterable[Path]]
-"""Integrates lanes; the rows of each path are those of `Lane.kept`, NaN where it failed."""
+"""Function that integrates batch elements and yields their trajectories.
+
+The rows of each trajectory are those of `Lane.kept`; they are NaN where the integration failed.
+"""
 
 
 def integrate(lanes: Lanes, rollouts: Rollouts, discard: Callable[[], None]) -> Motion:
-    """All lanes through `rollouts`.
+    """Integrate all batch elements with `rollouts`.
 
     Args:
-        lanes: the work.
-        rollouts: integrates those that can be.
-        discard: called where it is interrupted; it may have left the engine's world in any state.
+        lanes: batch to integrate.
+        rollouts: integrates the elements whose numbers are all finite.
+        discard: called after an interruption, which may leave the engine's world in any state.
 
     Returns:
-        The motion. A lane with a non-finite number or result is all NaN.
+        The trajectories. An element with a number or result that is not finite is all NaN.
     """
     count = lanes.steps.shape[1] // lanes.every + 1
     shape = (len(lanes.theta), count, lanes.x.shape[1])
@@ -117,11 +134,11 @@ def integrate(lanes: Lanes, rollouts: Rollouts, discard: Callable[[], None]) -> 
     work: list[Lane] = []
     places: list[tuple[int, Places]] = []
     for i in range(len(lanes.theta)):
-        # Lanes of one run follow each other and make the same steps.
+        # Elements of one run are adjacent and have the same steps.
         if i == 0 or not np.array_equal(lanes.steps[i], lanes.steps[i - 1]):
             timing = _timing(lanes.steps[i], lanes.every)
         lane = _lane(lanes, i, *timing[:3])
-        # A rollout that must fail would cost the engine its world.
+        # A rollout that is certain to fail would cost the engine its world.
         if all(np.isfinite(values).all() for values in _given(lane)):
             work.append(lane)
             places.append((i, timing[3]))
@@ -130,7 +147,7 @@ def integrate(lanes: Lanes, rollouts: Rollouts, discard: Callable[[], None]) -> 
             if finite(path):
                 for result, values in zip((motion.x, motion.v, motion.a), path, strict=True):
                     result[i] = values[rows]
-    except BaseException:  # an interrupted rollout leaves forces behind
+    except BaseException:  # an interrupted rollout leaves applied forces in the world
         discard()
         raise
     return motion
@@ -139,7 +156,13 @@ def integrate(lanes: Lanes, rollouts: Rollouts, discard: Callable[[], None]) -> 
 def in_turn(
     rollout: Callable[[Lane], Path], discard: Callable[[], None], lanes: Sequence[Lane]
 ) -> Iterator[Path]:
-    """One lane after the other; `discard` is called behind one that failed."""
+    """Integrate one element after the other and yield their trajectories.
+
+    Args:
+        rollout: integrates one element.
+        discard: called after an element that failed.
+        lanes: batch elements to integrate.
+    """
     for lane in lanes:
         path = rollout(lane)
         if not finite(path):
@@ -148,15 +171,23 @@ def in_turn(
 
 
 def finite(path: Path) -> bool:
-    """Whether all numbers of a path are."""
+    """Return whether all numbers of a trajectory are finite."""
     return all(bool(np.isfinite(values).all()) for values in path)
 
 
 def _timing(steps: Array, every: int) -> tuple[Places, Array, Places, Places]:
-    """Which steps are taken, their lengths, how many precede the states to keep, and which of these
-    each record is.
+    """Return the timing of one element.
+
+    Args:
+        steps: (S,) step sizes in seconds; zero where the element waits.
+        every: number of steps from one recorded state to the next.
+
+    Returns:
+        Indices of the steps with length > 0, their lengths, the step counts at which a state is
+        recorded, and for each record the index of its state.
     """
-    # A state behind a step of no length is the one before it: records share their rows.
+    # A step of zero length does not change the state: its record uses the same row as the previous
+    # one.
     moves = steps > 0
     moving = np.flatnonzero(moves)
     taken = np.concatenate([[0], np.cumsum(moves)])[::every]
@@ -168,7 +199,7 @@ def _lane(lanes: Lanes, i: int, moving: Places, steps: Array, kept: Places) -> L
     acting = [(effect, c[:, i : i + 1]) for effect, c in lanes.effects]
     effects = tuple((effect, c) for effect, c in acting if c.any())
     constants = {name: value[i : i + 1] for name, value in lanes.constants.items()}
-    # A lane that never moves has an input still, at its one instant.
+    # An element without any step of positive length still has an input at its single time.
     felt = moving if moving.size else slice(1)
     inputs = {name: value[i, felt] for name, value in lanes.inputs.items()}
     return Lane(
@@ -197,17 +228,21 @@ def _given(lane: Lane) -> list[Array]:
 
 
 def evened(steps: Array, every: int) -> Array:
-    """`steps` (S,), made equal if they are but for rounding: each change of step costs an engine
-    more than a step.
+    """Return equal steps if the given ones differ only by rounding.
+
+    A change of the step size costs an engine more than a step.
 
     Args:
-        steps: seconds, > 0.
-        every: steps from one sample to the next.
+        steps: (S,) step sizes in seconds, > 0.
+        every: number of steps from one sample to the next.
+
+    Returns:
+        The steps (S,), equal or unchanged.
     """
     if not steps.size:
         return steps
-    # By how much the sample times are missed counts, and not by how much each step differs: errors
-    # of rounded time stamps do not add up.
+    # The error of the sample times is compared, not that of each step, because errors of rounded
+    # time stamps do not add up.
     even = math.fsum(steps) / steps.size
     ends = even * np.arange(1, steps.size + 1)
     missed = np.abs(np.cumsum(steps) - ends).max()
@@ -216,18 +251,22 @@ def evened(steps: Array, every: int) -> Array:
 
 
 def legs(lane: Lane, *signals: Array) -> list[tuple[int, list[int]]]:
-    """The steps as legs in which neither the step nor any of `signals` (S,) changes.
+    """Split the steps into legs in which neither the step size nor any signal changes.
+
+    Args:
+        lane: batch element.
+        *signals: (S,) signals.
 
     Returns:
-        The number of the first step of each leg, and how many steps it takes from one state to keep
-        to the next, and at last to its end.
+        For each leg, the index of its first step, and the numbers of steps from one recorded state
+        to the next, with the remainder to the end of the leg as the last number.
     """
     size = lane.steps.size
     new = np.zeros(size, dtype=bool)
     new[:1] = True
     for values in (lane.steps, *signals):
         new[1:] |= values[1:size] != values[: size - 1]
-    # The engine is stopped where a leg begins and where a state is to be kept.
+    # The engine is stopped at the beginning of each leg and where a state is recorded.
     stops = new.copy()
     stops[lane.kept[lane.kept < size]] = True
     begins = np.flatnonzero(stops)
@@ -242,10 +281,14 @@ def legs(lane: Lane, *signals: Array) -> list[tuple[int, list[int]]]:
 
 
 def checked_time_step(time_step: float | None, system: type[System]) -> float:
-    """Longest step in seconds: as given, or the default for systems of this kind.
+    """Return the longest step in seconds: the given one, or the default of the system's kind.
+
+    Args:
+        time_step: longest step in seconds; None for the default.
+        system: system that the engine will integrate.
 
     Raises:
-        InputError: not finite or not positive.
+        InputError: the step is not finite or not positive.
     """
     if time_step is None:
         return DEFAULT_STEPS[system.kind]

@@ -1,27 +1,29 @@
-"""A ball stepped by an engine, read at second order in the step, its impacts solved by the engine
-where they happen.
+"""Integrate a ball with an engine at second order in the step, with impacts at their exact time.
 
-In flight the engine's velocity w is the one half a step before the position (see
+The engine's contact solver computes the impacts.
+
+In flight the engine's velocity w belongs to the time half a step before the position (see
 `sims.engines.external`): with acceleration a, a step of length h is
 
     w' = v + h/2 a                                                         (1)
     x' = x + h w'                                                          (2)
     v' = w' + h/2 a'                                                       (3)
 
-where the engine adds gravity g by itself and is given, beside it, what takes its velocity to (1):
+where the engine adds gravity g itself and receives the additional force per unit mass that leads to
+(1):
 
     f = (v + h/2 a - w) / h - g                                            (4)
 
-Under gravity alone that is the exact parabola. A step that would pass the ground is cut where it
-meets it: from height H above it, with upward speed u and upward acceleration l,
+Under gravity alone this is the exact parabola. A step that would pass the ground is cut at the
+impact: from height H above the ground, with upward speed u and upward acceleration l, the impact is
 
     s = (u + r) / -l = 2 H / (r - u),    r = sqrt(u^2 - 2 l H)             (5)
 
-seconds away. There the engine solves the contact in a step of its own, of which only the change of
-velocity counts, and the rest of the step follows. The error of an impact is thus that of the
-flight, of second order in h, and none under gravity alone.
+seconds away. There the engine solves the contact in a separate step, of which only the change of
+velocity is used, and the rest of the step follows. The error of an impact is therefore that of the
+flight: of second order in h, and zero under gravity alone.
 
-When bouncing is over is agreed with the batch engine (`sims.engines.ground`).
+The condition for the end of bouncing is that of the batch engine (`sims.engines.ground`).
 """
 
 from __future__ import annotations
@@ -34,16 +36,19 @@ from sims.engines.external import Lane, Path, legs
 from sims.engines.point import Impact, Pull, State, Vector, gravity, path_of
 
 _NO_TIME = 1e-12
-"""Seconds that are not worth a step."""
+"""Duration in seconds that is too short for a step."""
 INSIDE = 1e-9
-"""Metres inside the ground at which a ball is placed where contact must act beyond rounding."""
+"""Depth in metres at which a ball is placed inside the ground for contact.
+
+It is larger than rounding, so that contact certainly acts.
+"""
 
 
 class Mover(Protocol):
-    """A ball in an engine. Vectors are x, y, z; forces per unit mass."""
+    """Ball in an engine; vectors are x, y, z, and forces are per unit mass."""
 
     def start(self, constants: dict[str, float]) -> None:
-        """Make the world ready for a rollout, without a trace of the one before."""
+        """Prepare the world for a rollout, independent of the previous one."""
         ...
 
     def pace(self, step: float) -> None:
@@ -55,32 +60,49 @@ class Mover(Protocol):
         ...
 
     def advance(self, force: Vector) -> State:
-        """Take one step with this force (m/s^2) beside gravity."""
+        """Advance by one step with a force per unit mass (m/s^2) in addition to gravity."""
         ...
 
     def glide(self, counts: Sequence[int]) -> list[State]:
-        """Take so many steps under gravity alone, and so many again, and so on; what is reached
-        each time.
+        """Advance by each number of steps in `counts` under gravity alone.
+
+        Returns:
+            The state after each count.
         """
         ...
 
 
 class FlyingBall(Mover, Protocol):
-    """A ball over level ground."""
+    """Ball over level ground."""
 
     def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
-        """The velocity after the engine's contact with the ground at x, all else standing still;
-        `place` follows.
+        """Return the velocity after the engine's contact with the ground at x.
+
+        Nothing else moves. `place` must be called afterwards.
+
+        Args:
+            x: position at the impact.
+            v: velocity before the impact.
+            restitution: restitution coefficient.
+            friction: friction coefficient.
         """
         ...
 
     def hold(self) -> None:
-        """Let contact do no more from now on than hold the ball up; `place` follows."""
+        """Set contact that only supports the resting ball; `place` must be called afterwards."""
         ...
 
 
 def rollout(ball: FlyingBall, lane: Lane) -> Path:
-    """Integrate one lane."""
+    """Integrate one batch element.
+
+    Args:
+        ball: ball in an engine.
+        lane: batch element to integrate.
+
+    Returns:
+        Positions, velocities and accelerations (N, 3); NaN if the integration failed.
+    """
     ball.start(lane.numbers)
     flight = Flight(ball, lane)
     kept = set(lane.kept.tolist())
@@ -88,7 +110,7 @@ def rollout(ball: FlyingBall, lane: Lane) -> Path:
     rows = [flight.state]
     for begin, counts in legs(lane):
         states = flight.leg(steps[begin], counts)
-        # A leg may end between two samples, where nothing is kept.
+        # A leg may end between two samples, where no state is recorded.
         rows.extend(states if begin + sum(counts) in kept else states[:-1])
         if not math.isfinite(sum(flight.state)):
             break
@@ -96,16 +118,16 @@ def rollout(ball: FlyingBall, lane: Lane) -> Path:
 
 
 class Flight:
-    """One rollout.
+    """Rollout of one ball.
 
     Attributes:
         x: position.
         v: velocity.
         a: acceleration.
-        lift: the vertical one if there were no ground.
-        w: the engine's velocity; None when it must be placed anew.
-        step: the engine's, seconds; NaN when it must be set anew.
-        rests: whether it lies on the ground.
+        lift: vertical acceleration without the ground.
+        w: the engine's velocity; None when it must be set again.
+        step: the engine's step in seconds; NaN when it must be set again.
+        rests: whether the ball rests on the ground.
         time: seconds since the start.
     """
 
@@ -116,7 +138,7 @@ class Flight:
         self._gravity = gravity(lane)
         self._floor = float(lane.system.floor(lane.constants)[0, 0])
         x, y, z = lane.x.tolist()
-        self.x: Vector = x, y, max(z, self._floor)  # what begins inside the ground begins on it
+        self.x: Vector = x, y, max(z, self._floor)  # not inside the ground
         self.v: Vector = lane.v.tolist()
         self.a = self._gravity
         self.lift = self._gravity[2]
@@ -131,17 +153,26 @@ class Flight:
 
     @property
     def state(self) -> tuple[float, ...]:
-        """Position, velocity, acceleration."""
+        """Position, velocity and acceleration."""
         return (*self.x, *self.v, *self.a)
 
     def leg(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
-        """So many steps, and so many again, and so on; the state reached each time."""
+        """Advance by each number of steps in `counts`.
+
+        Args:
+            step: step size in seconds.
+            counts: numbers of steps.
+
+        Returns:
+            Position, velocity and acceleration after each count.
+        """
         if self._pull.any:
             return [self._stepwise(step, count) for count in counts]
         states: list[tuple[float, ...]] = []
         left = list(counts)
         while left:
-            # Steps until the impact: as many whole samples as fit go to the engine in one call.
+            # As many whole sample intervals as fit before the impact are integrated in one engine
+            # call.
             room = math.inf if self.rests else self._time_to_ground() / step
             whole = 0
             for count in left:
@@ -153,7 +184,7 @@ class Flight:
                 states.extend(self._glide(step, left[:whole]))
                 left = left[whole:]
                 continue
-            # Then the whole steps before the impact, and the one that it cuts.
+            # Then follow the whole steps before the impact, and the step that contains it.
             if room >= 1.0:
                 self._glide(step, (int(room),))
             self.meet(step)
@@ -164,9 +195,9 @@ class Flight:
         return states
 
     def _stepwise(self, step: float, count: int) -> tuple[float, ...]:
-        """Steps that ask for the forces; the state they reach."""
+        """Advance by `count` steps that evaluate the forces; return the state."""
         for _ in range(count):
-            # What lies on the ground and is pulled upward flies again.
+            # A resting ball that is pulled upward takes off.
             if self.rests and self.lift > 0.0:
                 self.rests = False
                 self.w = None
@@ -178,7 +209,11 @@ class Flight:
         return self.state
 
     def meet(self, left: float) -> None:
-        """A step with impacts."""
+        """Advance by a step that contains impacts.
+
+        Args:
+            left: length of the step in seconds.
+        """
         while left > _NO_TIME:
             until = math.inf if self.rests else self._time_to_ground()
             if until > _NO_TIME:
@@ -193,14 +228,14 @@ class Flight:
             self._strike()
 
     def _ready(self, step: float) -> Vector:
-        """Make the engine step so, placed if it must be; its velocity."""
-        # The velocity half a step before is another one for another step.
+        """Set the engine's step, and its state if necessary; return the engine's velocity."""
+        # The velocity half a step earlier depends on the step size.
         if step != self.step:
             self._ball.pace(step)
             self.step = step
             self.w = None
         if self.w is None:
-            # (1) backwards, from the step before.
+            # Equation (1) backwards, from the previous step.
             half = 0.5 * step
             x, y, z = self.v
             ax, ay, az = self.a
@@ -209,7 +244,7 @@ class Flight:
         return self.w
 
     def _glide(self, step: float, counts: Sequence[int]) -> list[tuple[float, ...]]:
-        """Steps under gravity alone, or at rest; the states they reach."""
+        """Advance under gravity alone, or at rest; return the state after each count."""
         self._ready(step)
         ax, ay, az = self.a
         x = 0.5 * step * ax
@@ -225,28 +260,28 @@ class Flight:
         return states
 
     def _forced(self, step: float) -> None:
-        """One step, in flight or at rest, under all that acts."""
+        """Advance by one step, in flight or at rest, under all forces."""
         half = 0.5 * step
         wx, wy, wz = self._ready(step)
         x, y, z = self.v
         ax, ay, az = self.a
         gx, gy, gz = self._gravity
-        # (4); at rest the engine's contact bears whatever presses the ball on the ground.
+        # (4); at rest the engine's contact balances any force that presses the ball on the ground.
         lift = self.lift - gz if self.rests else (z + half * az - wz) / step - gz
         along = (x + half * ax - wx) / step - gx
         across = (y + half * ay - wy) / step - gy
         self.x, self.w = self._ball.advance((along, across, lift))
         self.time += step
         wx, wy, wz = self.w
-        # The acceleration at the end is asked for at the velocity that (3) gives with that at the
-        # beginning, and (3) is taken with what comes back.
+        # The acceleration at the end is evaluated at the velocity that (3) gives with the
+        # acceleration at the beginning; then (3) is evaluated with the result.
         self.v = 2.0 * wx - x, 2.0 * wy - y, 0.0 if self.rests else 2.0 * wz - z
         self._look()
         ax, ay, az = self.a
         self.v = wx + half * ax, wy + half * ay, 0.0 if self.rests else wz + half * az
 
     def _look(self) -> None:
-        """Acceleration here and now; at rest the ground takes the vertical one."""
+        """Evaluate the acceleration at the present state; at rest the vertical one is zero."""
         x, y, z = self._gravity
         if self._pull.any:
             felt = self._pull.at(self.time, self.x, self.v)
@@ -257,14 +292,15 @@ class Flight:
         self.a = x, y, 0.0 if self.rests else z
 
     def _time_to_ground(self) -> float:
-        """Seconds until a flight with the present acceleration meets the ground; 0 on it, inf if
-        never.
+        """Return the seconds until the ball meets the ground with its present acceleration.
+
+        It is 0 on the ground and inf if the ball never meets it.
         """
         gap = max(self.x[2] - self._floor, 0.0)
         rate = self.v[2]
         lift = self.a[2]
         inside = rate * rate - 2.0 * lift * gap
-        # (5): of its two forms the one in which no digits are lost.
+        # (5): of the two forms, the one without cancellation is used.
         if rate > 0.0 or (rate == 0.0 and lift < 0.0):
             return (rate + math.sqrt(inside)) / -lift if lift < 0.0 else math.inf
         if inside < 0.0 or (rate == 0.0 and lift >= 0.0):
@@ -273,18 +309,18 @@ class Flight:
 
     def _strike(self) -> None:
         speed = -self.v[2]
-        self.w = None  # whatever contact makes of the velocity, the engine must be told
+        self.w = None  # contact changes the velocity, so the engine's state must be set again
         restitution, friction, over = self._contact.law(max(speed, 0.0), -self.a[2])
         if speed > 0.0:
             self.v = self._ball.strike(self.x, self.v, restitution, friction)
-            self.step = math.nan  # the engine's own step was that of the contact
+            self.step = math.nan  # the engine's step is still that of the contact
         if over:
             self._rest()
         self._look()
 
     def _rest(self) -> None:
         self.rests = True
-        # A little inside, so that the engine's contact acts from the first step on.
+        # Slightly inside the ground, so that the engine's contact acts from the first step on.
         x, y, z = self.x
         self.x = x, y, min(z, self._floor - INSIDE)
         self.v = self.v[0], self.v[1], 0.0

@@ -1,9 +1,11 @@
-"""Many balls at once, under forces that are asked at each step: `sims.engines.flight` with arrays
-in place of numbers.
+"""Integrate many balls together, with forces evaluated at each step.
 
-Between impacts lanes step together. A step with an impact is the lane's own: it is handed to a
-`flight.Flight`, which cuts it, and taken back behind it. What each lane comes to is the same as
-alone, to the bit. Lanes stand in the order of their number of steps, most first.
+The module contains the algorithm of `sims.engines.flight` with arrays instead of numbers.
+
+Between impacts all elements step together. A step with an impact is integrated separately: the
+element is transferred to a `flight.Flight`, which cuts the step at the impact, and transferred back
+afterwards. Each element gets the same result as when it is integrated alone, bit for bit. Elements
+are sorted by their number of steps, largest first.
 """
 
 from __future__ import annotations
@@ -23,48 +25,65 @@ from sims.system import Force, Friction
 
 
 class Balls(Protocol):
-    """As many balls over level ground as there are lanes, in an engine that steps them together."""
+    """Balls over level ground, one per batch element, that an engine steps together."""
 
     fewest: Mapping[str, int]
-    """As in `sims.engines.joints.Joints`; the kinds are ``known`` and ``asked``."""
+    """Minimum number of elements for which integration together is faster, by kind.
+
+    The kinds are ``known`` and ``asked``; see `sims.engines.joints.Joints`.
+    """
     most: int
-    """Lanes of which together no more are quicker."""
+    """Maximum number of elements for which integration together is faster."""
 
     def start(self, constants: dict[str, float], count: int) -> FlyingBall:
-        """Make the world ready for this many lanes of the same constants.
+        """Prepare the world for `count` batch elements with equal constants.
 
         Returns:
-            A ball for a lane by itself, also ready.
+            A separate ball for the integration of a single element, also prepared.
         """
         ...
 
     def pace(self, lanes: Places, step: Array) -> None:
-        """Set the step (m,) of some lanes."""
+        """Set the steps (m,) of the elements `lanes` (m,), in seconds."""
         ...
 
     def place(self, lanes: Places, x: Array, w: Array) -> None:
-        """Set position and the engine's velocity (m, 3) of some lanes."""
+        """Set position and the engine's velocity of some elements.
+
+        Args:
+            lanes: (m,) indices of the elements.
+            x: (m, 3) positions.
+            w: (m, 3) the engine's velocities.
+        """
         ...
 
     def state(self, count: int) -> tuple[Array, Array]:
-        """Positions and velocities (n, 3) of the first lanes; they follow what the engine does."""
+        """Return positions and velocities (n, 3) of the first `count` elements.
+
+        The arrays are views: they change when the engine steps.
+        """
         ...
 
     def advance(self, lanes: Places, force: Array) -> None:
-        """Let these lanes take one step with forces (m, 3), m/s^2, beside gravity."""
+        """Advance some elements by one step.
+
+        Args:
+            lanes: (m,) indices of the elements.
+            force: (m, 3) forces per unit mass in m/s^2, in addition to gravity.
+        """
         ...
 
     def lend(self, lane: int) -> None:
-        """Make the ball by itself this lane's."""
+        """Copy the contact state of an element to the separate ball."""
         ...
 
     def take_back(self, lane: int) -> None:
-        """Make this lane what the ball by itself has become."""
+        """Copy the contact state of the separate ball back to an element."""
         ...
 
 
 class Fliers:
-    """Balls together; see `sims.engines.together.Company`."""
+    """Integrate balls together; see `sims.engines.together.Company`."""
 
     alike = False
 
@@ -74,20 +93,23 @@ class Fliers:
         self.most = balls.most
 
     def kind(self, lane: Lane) -> str:
-        """``known`` or ``asked``; ``plain`` where nothing acts in flight."""
+        """Return the kind of an element: ``known``, ``asked``, or ``plain`` (no flight forces)."""
         if not any(isinstance(effect, Force | Friction) for effect, _ in lane.effects):
             return "plain"
         return "asked" if resistance(lane) is None else "known"
 
     def rollouts(self, lanes: Sequence[Lane]) -> list[Path | None]:
-        """See `sims.engines.together.Company`."""
+        """Integrate batch elements together and return their trajectories.
+
+        See `sims.engines.together.Company`.
+        """
         order = sorted(range(len(lanes)), key=lambda i: -lanes[i].steps.size)
         paths = _Flights(self._balls, [lanes[i] for i in order]).paths()
         return [paths[place] for place in np.argsort(order)]
 
 
 class _Flights:
-    """One integration."""
+    """Integration of several balls."""
 
     def __init__(self, balls: Balls, lanes: Sequence[Lane]) -> None:
         count = len(lanes)
@@ -101,7 +123,7 @@ class _Flights:
         ball = balls.start(first.numbers, count)
         self._own: list[Flight] = []
         self._rests = np.zeros(count, dtype=bool)
-        self._paced = np.full(count, np.nan)  # the engine's step
+        self._paced = np.full(count, np.nan)  # step that is set in the engine
         self._placed = np.zeros(count, dtype=bool)
         self._failed = np.zeros(count, dtype=bool)
         self._t = np.zeros(count)
@@ -118,7 +140,7 @@ class _Flights:
         self._keep(0)
 
     def paths(self) -> list[Path]:
-        """The motion of each lane; NaN where it failed."""
+        """Return the trajectory of each element; NaN where it failed."""
         for begin, end, count in self._table.phases():
             self._only(count)
             for k in range(begin, end):
@@ -126,14 +148,14 @@ class _Flights:
         return [self._path(i) for i in range(len(self._lanes))]
 
     def _only(self, count: int) -> None:
-        """Go on with the first lanes."""
+        """Continue with the first `count` elements only."""
         self._x, self._w = self._balls.state(count)
         for name in ("_rests", "_paced", "_placed", "_t", "_v", "_a", "_lift"):
             setattr(self, name, getattr(self, name)[:count])
         self._pulls.only(count)
 
     def _step(self, k: int) -> None:
-        """One step; what follows is `Flight._stepwise`, with its equations."""
+        """Advance by step `k`: `Flight._stepwise` and its equations for arrays."""
         h = self._table.steps[: self._t.size, k]
         flies = self._rests & (self._lift > 0.0)
         if flies.any():
@@ -146,7 +168,7 @@ class _Flights:
         before = [values[left] for values in (self._v, self._a, self._lift, self._t)]
         if some.size:
             self._forced(some, h)
-        # Of those with an impact nothing has come about yet.
+        # Elements with an impact have not been advanced yet: their state is restored.
         for values, kept in zip((self._v, self._a, self._lift, self._t), before, strict=True):
             values[left] = kept
         for i in left.tolist():
@@ -155,8 +177,9 @@ class _Flights:
             self._keep(int(self._table.rows[k + 1]))
 
     def _forced(self, some: Places, h: Array) -> None:
-        """A step of some lanes, in flight or at rest, under all that acts; of the others time and
-        velocity are of no meaning then.
+        """Advance some elements by one step, in flight or at rest, under all forces.
+
+        Afterwards, time and velocity of the other elements are not valid.
         """
         half = 0.5 * h[:, None]
         ahead = self._v + half * self._a
@@ -179,13 +202,16 @@ class _Flights:
         self._v[self._rests, 2] = 0.0
 
     def _look(self) -> None:
-        """Accelerations here and now; at rest the ground takes the vertical one."""
+        """Evaluate the accelerations at the present states; at rest the vertical one is zero."""
         self._a = self._gravity + self._pulls.at(self._t, self._x, self._v)
         self._lift = self._a[:, 2].copy()
         self._a[self._rests, 2] = 0.0
 
     def _time_to_ground(self) -> Array:
-        """(n,) as in `Flight`; NaN for what is no number."""
+        """Return the seconds (n,) until each ball meets the ground; NaN for failed elements.
+
+        See `Flight`.
+        """
         gap = np.maximum(self._x[:, 2] - self._floor, 0.0)
         rate = self._v[:, 2]
         lift = self._a[:, 2]
@@ -198,7 +224,7 @@ class _Flights:
         return np.where(rises, back, down)
 
     def _meet(self, i: int, step: float) -> None:
-        """A step with impacts."""
+        """Advance element `i` by a step that contains impacts."""
         own = self._own[i]
         self._balls.lend(i)
         own.x = self._x[i].tolist()
@@ -213,7 +239,7 @@ class _Flights:
         self._back(i)
 
     def _back(self, i: int) -> None:
-        """Take a lane back from its own flight."""
+        """Copy the state of element `i` back from its separate `Flight`."""
         own = self._own[i]
         self._balls.take_back(i)
         self._v[i] = own.v
@@ -229,7 +255,7 @@ class _Flights:
         self._balls.place(one, np.array([own.x]), np.array([own.w or own.v]))
 
     def _set_aside(self) -> None:
-        """Put what has failed back to where it began; what becomes of it is not looked at."""
+        """Put failed elements back to their initial state and discard their results."""
         bad = np.flatnonzero(~np.isfinite(self._x.sum(axis=1) + self._w.sum(axis=1)))
         self._failed[bad] = True
         self._v[bad] = 0.0

@@ -1,9 +1,10 @@
-"""The forces on lanes from outside an engine, and what dry friction leaves of them.
+"""Forces of system and effects that are applied from outside an engine, and dry friction.
 
-Numbers and arrays: an engine that goes lane by lane takes `rate` and `kick`, one that steps many
-lanes at once `rates` and `kicks`. They are the same to the bit, and tests hold them to it.
+Functions exist for numbers and for arrays: an engine that integrates one batch element at a time
+uses `rate` and `kick`, one that steps many elements together uses `rates` and `kicks`. Both give
+the same results bit for bit, which tests check.
 
-Dry friction of limit L leaves of a force F, at velocity v,
+Dry friction with limit L changes a force F at velocity v to
 
     F - L sign(v)                      where v is not 0                    (1)
     F - L sign(F), or 0 if |F| <= L    where v is 0                        (2)
@@ -24,14 +25,14 @@ from sims.system import Effect, Force, Friction, Moment, System
 
 @dataclass(frozen=True)
 class _Part:
-    """An effect on those of the lanes that it acts on.
+    """Effect on the batch elements where it is active.
 
     Attributes:
-        effect: of the kinds `Force` and `Friction`.
+        effect: effect of class `Force` or `Friction`.
         c: (K, r, 1) its coefficients.
-        moment: what it is asked at, r rows.
-        rows: (r,) which rows of the whole moment these are; None for all of them.
-        felt: what changes from step to step in `moment`.
+        moment: state snapshot of its r rows.
+        rows: (r,) indices of these rows in the whole snapshot; None for all.
+        felt: arrays of `moment` that change from step to step.
     """
 
     effect: Effect
@@ -42,13 +43,14 @@ class _Part:
 
 
 class Forces:
-    """The forces on lanes from outside the engine: the effects' and the system's own but for
-    gravity.
+    """Forces on batch elements that the engine does not apply itself: all except gravity.
+
+    They are the forces of the effects and of the system.
 
     Args:
-        lanes: whose, of one system and the same constants' names.
-        looks: how many velocities to ask for at once; rows are those of the first velocity, a lane
-            each, then those of the second.
+        lanes: batch elements of one system with the same names of constants.
+        looks: number of velocities evaluated in one call. The rows of the snapshot are those of the
+            first velocity, one per element, then those of the second.
     """
 
     def __init__(self, lanes: Sequence[Lane], looks: int) -> None:
@@ -70,10 +72,10 @@ class Forces:
         self._system: System = first.system
         self._inputs = inputs
         self._felt = _felt(self.moment)
-        # Most systems have no passive force but gravity, which the engine applies by itself.
+        # Most systems have no passive force except gravity, which the engine applies itself.
         self._more = type(first.system).passive is not System.passive
         self._driven = bool(inputs) or self._more
-        # Every velocity is asked for at once, a row each: a call costs more than its rows.
+        # All velocities are evaluated in one call, one row each: a call costs more than its rows.
         parts = [_part(effect, lanes, looks, self.moment) for effect in first.declared]
         acting = [part for part in parts if part is not None]
         self._forces = [part for part in acting if isinstance(part.effect, Force)]
@@ -83,15 +85,15 @@ class Forces:
         self.rubs = bool(self._frictions)
 
     def feel(self, inputs: Mapping[str, float | Array]) -> None:
-        """Set the inputs: numbers, or (looks * lanes, 1)."""
+        """Set the inputs: numbers, or arrays (looks * lanes, 1)."""
         for name, value in inputs.items():
             self._inputs[name][:] = value
 
     def force(self) -> Array:
-        """(rows, D) generalised force at `moment`, friction apart."""
+        """Return the generalised force (rows, D) at `moment`, without dry friction."""
         total = self._system.drive(self.moment) if self._driven else self._nothing
         if self._more:
-            # What the drive works against, less the gravity that is the engine's own.
+            # Passive forces of the system, without the gravity that the engine applies.
             total = total - self._system.passive(self.moment) - self._system.weight(self.moment)
         for part in self._forces:
             assert isinstance(part.effect, Force)
@@ -104,11 +106,11 @@ class Forces:
         return total
 
     def limit(self) -> float:
-        """Largest friction on the first lane."""
+        """Return the friction limit of the first batch element."""
         return float(self.limits()[0])
 
     def limits(self) -> Array:
-        """(lanes,) largest friction at the first of the velocities."""
+        """Return the friction limits (lanes,) at the first of the velocities."""
         total = np.zeros(len(self.moment.x))
         for part in self._frictions:
             assert isinstance(part.effect, Friction)
@@ -120,20 +122,20 @@ class Forces:
         return total[: self._count]
 
     def _gather(self, part: _Part) -> None:
-        """Bring the rows of a part up to the whole moment's."""
+        """Copy the rows of an effect from the whole state snapshot."""
         assert part.rows is not None
-        # Every row is there: `clip` spares looking for one that is not.
+        # All indices are valid: `clip` skips the bounds check.
         for values, own in zip(self._felt, part.felt, strict=True):
             values.take(part.rows, 0, own, "clip")
 
 
 def _felt(moment: Moment) -> tuple[Array, ...]:
-    """All that changes from step to step."""
+    """Return the arrays of a snapshot that change from step to step."""
     return moment.t, moment.x, moment.v, *moment.inputs.values()
 
 
 def _part(effect: Effect, lanes: Sequence[Lane], looks: int, whole: Moment) -> _Part | None:
-    """An effect on the lanes that have it; None if none has."""
+    """Return an effect on the elements where it is active; None if it is active nowhere."""
     own = [_coefficients(lane, effect) for lane in lanes]
     on = [i for i, c in enumerate(own) if c is not None]
     if not on:
@@ -151,12 +153,18 @@ def _part(effect: Effect, lanes: Sequence[Lane], looks: int, whole: Moment) -> _
 
 
 def _coefficients(lane: Lane, effect: Effect) -> Array | None:
-    """(K, 1, 1) of this effect; None if it does not act."""
+    """Return the coefficients (K, 1, 1) of this effect; None if it is not active."""
     return next((c for acting, c in lane.effects if acting is effect), None)
 
 
 def rate(velocity: float, force: float, limit: float) -> float:
-    """The force that is left of `force` when dry friction has taken what it can."""
+    """Return a force minus dry friction, equations (1) and (2).
+
+    Args:
+        velocity: velocity of the body.
+        force: force without dry friction.
+        limit: limit of dry friction.
+    """
     if not limit:
         return force
     if velocity:
@@ -165,7 +173,13 @@ def rate(velocity: float, force: float, limit: float) -> float:
 
 
 def rates(velocity: Array, force: Array, limit: Array) -> Array:
-    """`rate` for many lanes (n,)."""
+    """Return forces minus dry friction: `rate` for many batch elements (n,).
+
+    Args:
+        velocity: (n,) velocities.
+        force: (n,) forces without dry friction.
+        limit: (n,) limits of dry friction.
+    """
     taken = np.copysign(limit, velocity)  # (1)
     if not np.logical_and.reduce(velocity):
         held = np.where(np.abs(force) > limit, np.copysign(limit, force), force)  # (2)
@@ -174,23 +188,24 @@ def rates(velocity: Array, force: Array, limit: Array) -> Array:
 
 
 def kick(velocity: float, force: float, limit: float, inverse: float, duration: float) -> float:
-    """The velocity after a constant force and dry friction have acted for `duration`.
+    """Return the velocity after a constant force and dry friction have acted for `duration`.
 
-    Exact: friction opposes the motion until it stops, then holds it still if it can.
+    The result is exact: friction opposes the motion until the body stops, and then holds it if the
+    force is within the limit.
 
     Args:
-        velocity: before.
-        force: without friction.
-        limit: largest friction.
-        inverse: one over the inertia.
-        duration: seconds.
+        velocity: velocity before.
+        force: force without dry friction.
+        limit: limit of dry friction.
+        inverse: inverse of the inertia.
+        duration: time in seconds.
     """
     if velocity and limit:
         slope = rate(velocity, force, limit) * inverse
         after = velocity + slope * duration
         if after * velocity >= 0:
             return after
-        # It came to rest on the way, -v / slope after the beginning; the time left begins there.
+        # The body stops at time -v / slope; the remaining time begins there.
         duration += velocity / slope
         velocity = 0.0
     return velocity + rate(velocity, force, limit) * inverse * duration
@@ -199,7 +214,15 @@ def kick(velocity: float, force: float, limit: float, inverse: float, duration: 
 def kicks(
     velocity: Array, force: Array, limit: Array | None, inverse: Array, duration: Array
 ) -> Array:
-    """`kick` for many lanes (n,); `limit` is None where no lane has friction."""
+    """Return velocities after constant forces: `kick` for many batch elements (n,).
+
+    Args:
+        velocity: (n,) velocities before.
+        force: (n,) forces without dry friction.
+        limit: (n,) limits of dry friction; None where no element has friction.
+        inverse: (n,) inverse inertias.
+        duration: (n,) times in seconds.
+    """
     if limit is None:
         free: Array = velocity + force * inverse * duration
         return free
@@ -208,7 +231,7 @@ def kicks(
     after = slope * duration
     after += velocity
     onward = after * velocity
-    # Most often no lane turns; a lane that has failed says nothing about the others.
+    # In most steps no element reverses. `fmin` ignores the NaN of failed elements.
     if np.fmin.reduce(onward) < 0.0:
         turns = (onward < 0.0) & (limit != 0.0)
         left = duration[turns] + velocity[turns] / slope[turns]

@@ -1,25 +1,25 @@
-"""Impacts with level ground: what becomes of the velocity, and when bouncing has died out.
+"""Impacts with level ground: velocity after an impact, and end of bouncing.
 
-The last coordinate strikes the ground at its `floor`; the others run along it. Restitution e is the
-system's, changed by the contact effects in their order. With the speed n against the ground and the
-velocity u along it,
+The last coordinate strikes the ground at its `floor`; the others are tangential. Restitution e is
+the system's, modified by the contact effects in their order. With the normal speed n and the
+tangential velocity u before the impact,
 
     n' = e n                                                               (1)
     u' = u max(1 - mu (1 + e) n / |u|, 1 - g)                              (2)
 
-so the ground takes tangential speed mu (1 + e) n, never more than there is (R. M. Brach, J. Appl.
-Mech. 56(1), 133, 1989, doi:10.1115/1.3176033): g is 1, or less where the system says at which share
-of it a body that spins up grips. A ball that rests on the ground has no impacts and is not slowed
-by it.
+so the ground removes the tangential speed mu (1 + e) n, but never more than there is (R. M. Brach,
+J. Appl. Mech. 56(1), 133, 1989, doi:10.1115/1.3176033). The maximum tangential impulse share g is
+1, or less where the system specifies at which share a body that starts to spin begins to roll. A
+ball that rests on the ground has no impacts and is not slowed by it.
 
-Bounces of a ball with e < 1 die out in finite time after infinitely many. A flight that leaves with
-speed n' under a downward acceleration f lasts
+A ball with e < 1 stops bouncing in finite time after infinitely many bounces. A flight that starts
+with speed n' under a downward acceleration f lasts
 
     2 n' / f                                                               (3)
 
-and bouncing is taken as over once that is less than `SHORTEST`, or after `PATIENCE` flights below
-`SHORT` in a row. The bounces left out strike with n', e n', e^2 n' ..., and what they would have
-taken from the tangential speed is taken at once:
+Bouncing is treated as finished when this time is less than `SHORTEST`, or after more than
+`PATIENCE` consecutive flights shorter than `SHORT`. The omitted bounces have impact speeds n', e
+n', e^2 n', ..., and the tangential speed that they would remove is removed at once:
 
     mu (1 + e) (n' + e n' + e^2 n' + ...) = mu (1 + e) n' / (1 - e)        (4)
 """
@@ -38,26 +38,26 @@ Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 SHORTEST = 5e-5
-"""Seconds that a flight lasts at least; one of that length rises 3 nm."""
+"""Minimum duration of a flight in seconds; a flight of this duration rises 3 nm."""
 SHORT = 2e-3
-"""Seconds below which a flight counts against `PATIENCE`."""
+"""Duration in seconds below which a flight counts as short, see `PATIENCE`."""
 PATIENCE = 64
-"""Short flights in a row after which bouncing is over."""
+"""Maximum number of consecutive short flights; after more, bouncing is finished."""
 
 
 @dataclass
 class Outcome:
-    """What follows an impact: velocity (n, D) and whether the ball stays on the ground (n,)."""
+    """Result of impacts: velocity (n, D), and whether the ball stays on the ground (n,)."""
 
     v: Array
     rests: Mask
 
 
 class Ground:
-    """The ground under every lane.
+    """Ground contact of all batch elements.
 
     Attributes:
-        floor: (L, 1) value of the last coordinate where it is struck.
+        floor: (L, 1) value of the last coordinate at which it strikes the ground.
     """
 
     def __init__(self, lanes: Lanes) -> None:
@@ -71,12 +71,15 @@ class Ground:
         self._shorts = np.zeros(len(lanes.x), dtype=np.intp)
 
     def strike(self, lanes: Indices, v: Array, a: Array) -> Outcome:
-        """The impact of some lanes.
+        """Compute the impact of some batch elements.
 
         Args:
-            lanes: (n,) which.
-            v: (n, D) velocity before, downward.
-            a: (n, D) acceleration of free motion there.
+            lanes: (n,) indices of the elements.
+            v: (n, D) velocity before the impact, directed downward.
+            a: (n, D) acceleration of free motion at the impact.
+
+        Returns:
+            Velocities after the impact, and which elements stay on the ground.
         """
         speed = np.abs(v[:, -1:])
         e = self._restitution[lanes]
@@ -84,7 +87,7 @@ class Ground:
         for effect, c in self._effects:
             own = c[:, lanes]
             on = (own != 0).any(axis=0)
-            # Only where it acts: an effect that is off changes nothing, not even by rounding.
+            # An inactive effect is not applied, so that it changes nothing, not even by rounding.
             changed = effect.restitution(own, e, speed)
             e = np.where(on, changed, e)
             mu = mu + np.where(on, effect.friction(own), 0.0)
@@ -109,9 +112,9 @@ class Ground:
         return Outcome(after, rests[:, 0])
 
     def _over(self, lanes: Indices, up: Array, down: Array) -> Mask:
-        """(n, 1) whether bouncing is over, after an impact that would be left with speed `up`."""
+        """Return whether bouncing is finished (n, 1), after an impact with rebound speed `up`."""
         flight = 2.0 * up / np.where(down > 0, down, 1.0)  # (3)
-        falls = down > 0  # what is not drawn to the ground flies away, however slowly
+        falls = down > 0  # without downward acceleration it never comes back
         is_short = (falls & (flight < SHORT))[:, 0]
         shorts = np.where(is_short, self._shorts[lanes] + 1, 0)
         self._shorts[lanes] = shorts
@@ -121,7 +124,7 @@ class Ground:
 
 
 def _size(v: Array) -> Array:
-    """(n, 1) length of vectors (n, k)."""
+    """Return the length (n, 1) of vectors (n, k)."""
     if v.shape[1] == 1:
         return np.abs(v)
     size: Array = np.sqrt((v * v).sum(axis=1, keepdims=True))

@@ -1,12 +1,13 @@
-"""Lanes on which effects with states of their own act: the system with as many coordinates more.
+"""Extend a system by the hidden states of effects, one coordinate for each.
 
-A hidden coordinate beside those of the system lets any engine of several coordinates integrate an
-effect's state. The enlarged system counts force by the inertia that is left to its own coordinates,
+With a hidden coordinate in addition to those of the system, any engine for several coordinates can
+integrate the state of an effect. The augmented system scales forces by the inertia that remains for
+its own coordinates,
 
-    M' = M (1 - sum of the shares behind)                                  (1)
+    M' = M (1 - sum of the load-side shares)                               (1)
 
-so that what acts on them needs no change, and a hidden rate r is written as the force M' r. Dry
-friction keeps to the system's own coordinates.
+so that the forces on them need no change, and a rate r of a hidden state is written as the force M'
+r. Dry friction acts on the system's own coordinates only.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ from sims.system import (
 
 
 class Enlarged(System):
-    """A system with hidden coordinates behind its own; `enlarged` makes one.
+    """System with hidden coordinates after its own; `enlarged` makes one.
 
-    Its parameters are those of the system, then the coefficients of the effects.
+    Its parameters are those of the system, followed by the coefficients of the effects.
 
     Attributes:
-        inner: the system.
-        effects: those with a state, each with one coordinate.
+        inner: system without hidden coordinates.
+        effects: effects with a hidden state, one coordinate for each.
     """
 
     inner: ClassVar[System]
@@ -49,7 +50,7 @@ class Enlarged(System):
 
     @classmethod
     def plain(cls, moment: Moment) -> Moment:
-        """The moment as it is without hidden coordinates."""
+        """Return the state snapshot without hidden coordinates."""
         own = len(cls.inner.coordinates)
         theta = moment.theta[:, : len(cls.inner.parameters)]
         x, v = moment.x[:, :own], moment.v[:, :own]
@@ -57,7 +58,7 @@ class Enlarged(System):
 
     @classmethod
     def coefficients_of(cls, theta: Array) -> list[Array]:
-        """Each effect's coefficients (K, L, 1)."""
+        """Return the coefficients (K, L, 1) of each effect."""
         found = []
         place = len(cls.inner.parameters)
         for effect in cls.effects:
@@ -67,7 +68,12 @@ class Enlarged(System):
         return found
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """(L, 1) inertia of the system's own coordinates."""
+        """Return the inertia (L, 1) of the system's own coordinates.
+
+        Args:
+            theta: (L, p) parameters of the augmented system.
+            constants: (L, 1) constants by name.
+        """
         whole = self.inner.mass(theta[:, : len(self.inner.parameters)], constants)
         pairs = zip(self.effects, self.coefficients_of(theta), strict=True)
         left = np.ones_like(whole)
@@ -76,11 +82,11 @@ class Enlarged(System):
         return whole * left  # (1)
 
     def weight(self, moment: Moment) -> Array:
-        """(L, D) of the system."""
+        """Return the force of gravity (L, D) of the system."""
         return padded(self.inner.weight(self.plain(moment)), moment)
 
     def force(self, moment: Moment) -> Array:
-        """(L, D) of the system and the effects, on all coordinates."""
+        """Return the force (L, D) of system and hidden-state effects on all coordinates."""
         plain = self.plain(moment)
         own = len(self.inner.coordinates)
         total = self.inner.force(plain)
@@ -97,18 +103,30 @@ class Enlarged(System):
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """What the system's sensors show."""
+        """Return the sensor channels of the system without hidden coordinates.
+
+        Args:
+            x: (L, S, D) positions.
+            v: (L, S, D) velocities.
+            a: (L, S, D) accelerations.
+            constants: constants by name.
+        """
         own = len(self.inner.coordinates)
         return self.inner.observe(x[:, :, :own], v[:, :, :own], a[:, :, :own], constants)
 
 
 class _Pushes(Force):
-    """A force on the system's own coordinates; `_acting` makes one."""
+    """Force on the system's own coordinates; `_acting` makes one."""
 
     inner: ClassVar[Force]
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """As without hidden coordinates."""
+        """Return the force of the base effect, padded with zeros.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of the augmented system.
+        """
         return padded(self.inner.force(c, _plain(moment)), moment)
 
 
@@ -118,18 +136,31 @@ class _Rubs(Friction):
     inner: ClassVar[Friction]
 
     def limit(self, c: Array, moment: Moment) -> Array:
-        """As without hidden coordinates."""
+        """Return the friction limit of the base effect.
+
+        Args:
+            c: (K, L, 1) coefficients.
+            moment: state snapshot of the augmented system.
+        """
         return self.inner.limit(c, _plain(moment))
 
 
 def integrate(engine: Engine, lanes: Lanes) -> Motion:
-    """The motion of lanes, on some of which effects with states may act."""
+    """Integrate batch elements, on some of which hidden-state effects may be active.
+
+    Args:
+        engine: engine for several coordinates.
+        lanes: batch to integrate.
+
+    Returns:
+        The trajectories of the system's own coordinates.
+    """
     hidden = [(e, c) for e, c in lanes.effects if isinstance(e, Hidden)]
     if not hidden:
         return engine.integrate(lanes)
     others = tuple((e, c) for e, c in lanes.effects if not isinstance(e, Hidden))
     on = np.array([c[0, :, 0] > 0 for _, c in hidden])
-    # Most calls have none of them, and are as quick as ever.
+    # Most calls have no hidden-state effects; they must not become slower.
     if not on.any():
         return engine.integrate(replace(lanes, effects=others))
     motions = []
@@ -147,7 +178,7 @@ def integrate(engine: Engine, lanes: Lanes) -> Motion:
 
 
 def _enlarged(lanes: Lanes, effects: Sequence[tuple[Hidden, Array]]) -> Lanes:
-    """The same lanes of the enlarged system."""
+    """Return the batch for the augmented system."""
     kinds = tuple(type(effect) for effect, _ in effects)
     system = enlarged(type(lanes.system), kinds)()
     inputs = {name: values[:, :1] for name, values in lanes.inputs.items()}
@@ -166,7 +197,12 @@ def _enlarged(lanes: Lanes, effects: Sequence[tuple[Hidden, Array]]) -> Lanes:
 
 @cache
 def enlarged(system: type[System], effects: tuple[type[Hidden], ...]) -> type[Enlarged]:
-    """A system with a hidden coordinate for each of these effects."""
+    """Return the system with a hidden coordinate for each of these effects.
+
+    Args:
+        system: system to extend.
+        effects: effect classes with a hidden state.
+    """
     names = [effect.name for effect in effects]
     declared: dict[str, Any] = {
         "inner": system(),
@@ -192,7 +228,7 @@ def enlarged(system: type[System], effects: tuple[type[Hidden], ...]) -> type[En
 
 @cache
 def _acting(effect: type[Effect]) -> type[Effect]:
-    """An effect on the system's own coordinates, for the enlarged system."""
+    """Return an effect that acts on the system's own coordinates of the augmented system."""
     if not issubclass(effect, (Force, Friction)):
         return effect
     base = _Pushes if issubclass(effect, Force) else _Rubs
@@ -206,6 +242,11 @@ def _plain(moment: Moment) -> Moment:
 
 
 def padded(force: Array, moment: Moment) -> Array:
-    """(L, D) with nothing on the hidden coordinates of the moment."""
+    """Return a force (L, D), padded with zeros for the hidden coordinates.
+
+    Args:
+        force: (L, d) force on the system's own coordinates.
+        moment: state snapshot with hidden coordinates.
+    """
     nothing = np.zeros_like(moment.x[:, force.shape[1] :])
     return np.concatenate([force, nothing], axis=1)

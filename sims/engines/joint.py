@@ -1,33 +1,33 @@
-"""Systems of one coordinate, stepped by an engine and read at second order in the step.
+"""Integrate a one-coordinate system with an engine, at second order in the step.
 
-The engine's velocity w is the one half a step before the position. With force f(t, x, v, u) beside
-the gravity G(x), each step of length h from (x, v) is
+The engine's velocity w belongs to the time half a step before the position. With force f(t, x, v,
+u) in addition to the gravity G(x), each step of length h from (x, v) is
 
     start:  w  = v + h/2 (G(x) + f(t, x, v, u)) / M                        (1)
     engine: x' = x + h w                                                   (2)
     end:    v' = w + h/2 (G(x') + f(t', x', v', u)) / M                    (3)
 
-where (1) is put in as one force over the step,
+where (1) is applied as one force over the step,
 
     F = (w - w_before) M / h - G(x)                                        (4)
 
-and (3) is solved for v' by one Newton step, so that damping, however strong, is stable (the two
+and (3) is solved for v' by one Newton step, so that damping is stable however strong it is (the two
 halves together are the trapezoidal rule in v), and dry friction is exact in each half
 (`forces.kick`).
 
-Where nothing acts but inputs and viscous damping c, the engine's own joint damping carries it,
-explicit in w, and the engine need not be interrupted. With J = M + h c / 2 in place of M,
+If only inputs and viscous damping c act, the engine's own joint damping, explicit in w, represents
+it, and the engine runs without interruption. With J = M + h c / 2 in place of M,
 
     w' = w + h (T - c w) / J,  which is  w' - w = h (T - c (w + w') / 2) / M    (5)
 
-has its damping at the midpoint, so that v = (w + w') / 2 is the velocity at x. From the engine's
-velocity half a step before x, and back to it,
+has its damping at the midpoint, so that v = (w + w') / 2 is the velocity at x. The conversions
+between the engine's velocity w, half a step before x, and v are
 
     v = (w + h/2 (G + u) / M) / (1 + h/2 c / M)                            (6)
     w = (1 + h/2 c / M) v - h/2 (G + u) / M                                (7)
 
-and where the input goes from u to u', the step has half a kick of each: w' - w = h (G + (u + u') /
-2 - c v) / M with v of (6) is (5) with T = G plus
+When the input changes from u to u', the step has half an impulse of each: w' - w = h (G + (u + u')
+/ 2 - c v) / M with v of (6) is (5) with T = G plus
 
     u' + (1/2 - h c / (4 M)) (u - u')                                      (8)
 """
@@ -49,42 +49,67 @@ from sims.engines.scalar import Resistance, is_library, resistance
 
 
 class Joint(Protocol):
-    """A body on one hinge or guide in an engine."""
+    """Body on one hinge or guide in an engine."""
 
     open_loop: bool
     """Whether the system's drive depends on its inputs alone."""
 
     def start(self, constants: dict[str, float]) -> None:
-        """Make the world ready for a rollout."""
+        """Prepare the world for a rollout with these constants."""
         ...
 
     def pace(self, step: float, inertia: float, damping: float) -> bool:
-        """Set step, generalised inertia and damping; False if the engine cannot represent the
-        inertia.
+        """Set step size, generalised inertia and viscous damping.
+
+        Args:
+            step: step size in seconds.
+            inertia: generalised inertia in kg or kg*m^2.
+            damping: viscous joint damping.
+
+        Returns:
+            False if the engine cannot represent the inertia.
         """
         ...
 
     def place(self, x: float, w: float) -> None:
-        """Set position and the engine's velocity."""
+        """Set the position and the engine's velocity."""
         ...
 
     def gravity(self, x: float) -> float:
-        """The generalised force that the engine itself applies at position x."""
+        """Return the generalised force of the engine's own gravity at position x."""
         ...
 
     def advance(self, force: float) -> tuple[float, float]:
-        """Take one step with this generalised force beside gravity; position and the engine's
-        velocity after it.
+        """Advance by one step with a generalised force in addition to gravity.
+
+        Returns:
+            Position and the engine's velocity after the step.
         """
         ...
 
     def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
-        """As `advance`, for so many steps, and so many again, and so on; the states reached."""
+        """Advance by each number of steps in `counts` with a constant generalised force.
+
+        Args:
+            force: generalised force in addition to gravity.
+            counts: numbers of steps.
+
+        Returns:
+            Position and the engine's velocity after each count.
+        """
         ...
 
 
 def rollout(joint: Joint, lane: Lane) -> Path:
-    """Integrate one lane; NaN where the engine cannot represent it."""
+    """Integrate one batch element.
+
+    Args:
+        joint: body in an engine.
+        lane: batch element to integrate.
+
+    Returns:
+        The trajectory; NaN if the engine cannot represent the element.
+    """
     joint.start(lane.numbers)
     inertia = float(lane.system.mass(lane.theta, lane.constants)[0, 0])
     way = way_of(lane, joint.open_loop)
@@ -97,14 +122,15 @@ def rollout(joint: Joint, lane: Lane) -> Path:
 
 @dataclass(frozen=True)
 class Way:
-    """How a lane is integrated: the quickest way of three that carries all that acts, since asking
-    effects for their force takes longer than the engine's own step.
+    """Integration mode of a batch element: the fastest of three that includes all active forces.
+
+    Evaluating effects takes longer than the engine's own step.
 
     Attributes:
-        damping: the viscous damping that is all that acts beside inputs; the engine runs on its
-            own. None where more acts.
-        opposing: what depends on speed alone and is written in plain numbers; None where more acts,
-            and all must be asked.
+        damping: viscous damping, if nothing else acts except inputs, so that the engine runs on its
+            own; None otherwise.
+        opposing: closed-form resistance, if all forces depend on speed alone; None if effects must
+            be evaluated at each step.
     """
 
     damping: float | None
@@ -112,13 +138,18 @@ class Way:
 
 
 def way_of(lane: Lane, open_loop: bool) -> Way:
-    """The quickest way; `open_loop` says whether the drive depends on the inputs alone."""
+    """Choose the fastest integration mode of a batch element.
+
+    Args:
+        lane: batch element to integrate.
+        open_loop: whether the drive depends on the inputs alone.
+    """
     opposing = resistance(lane) if open_loop else None
     return Way(None if opposing is None else _carried(lane), opposing)
 
 
 def _carried(lane: Lane) -> float | None:
-    """The damping that stands for all effects of the lane; None if it cannot."""
+    """Return the viscous damping that is equivalent to all effects; None if there is none."""
     if not lane.effects:
         return 0.0
     (effect, c), *others = lane.effects
@@ -128,8 +159,9 @@ def _carried(lane: Lane) -> float | None:
 
 
 def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
-    """No feedback from the motion but viscous damping: the engine runs on its own while the input
-    is constant.
+    """Integrate without feedback except viscous damping.
+
+    The engine runs on its own while the input is constant.
     """
     drive = drive_of(lane)
     forces = drive.tolist()
@@ -146,7 +178,7 @@ def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
         u = forces[begin]
         end = begin + sum(counts)
         if h != step:
-            # The velocity half a step before is another one for another step.
+            # The velocity half a step earlier depends on the step size.
             if begin:
                 v = whole(w, joint.gravity(x) + felt, inertia, damping, step)
             if not joint.pace(h, inertia + 0.5 * h * damping, damping):  # (5)
@@ -161,7 +193,7 @@ def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
             break
         step = h
         felt = u
-        # A leg may end between two samples, where the input changes and nothing is kept.
+        # A leg may end between two samples, where the input changes and no state is recorded.
         if end not in kept:
             states.pop()
         rows.extend((*state, h, u) for state in states)
@@ -171,14 +203,17 @@ def _open(joint: Joint, lane: Lane, inertia: float, damping: float) -> Path:
 
 
 def read_off(lane: Lane, rows: Array, inertia: float, damping: float) -> Path:
-    """The motion from what a run without interruption left behind.
+    """Convert the states of an uninterrupted run to a trajectory.
 
     Args:
-        lane: that was integrated.
-        rows: (N, 4) position, the engine's velocity, step and force of the inputs at each state to
-            keep.
-        inertia: generalised.
-        damping: viscous.
+        lane: integrated batch element.
+        rows: (N, 4) position, the engine's velocity, step size and force of the inputs at each
+            recorded state.
+        inertia: generalised inertia.
+        damping: viscous damping.
+
+    Returns:
+        Positions, velocities and accelerations (N, 1).
     """
     positions, w_at, step_at, felt_at = rows.T
     force = _weights(lane, positions) + felt_at
@@ -189,28 +224,48 @@ def read_off(lane: Lane, rows: Array, inertia: float, damping: float) -> Path:
 
 
 def whole(w: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
-    """The velocity at the time of the position, from the engine's half a step before and the force
-    on the position; numbers or arrays.
+    """Return the velocity at the time of the position, equation (6); numbers or arrays.
+
+    Args:
+        w: the engine's velocity, half a step before the position.
+        force: force at the position.
+        inertia: generalised inertia.
+        damping: viscous damping.
+        step: step size in seconds.
     """
     half = 0.5 * step / inertia
     return (w + half * force) / (1.0 + half * damping)  # (6)
 
 
 def halfway(v: Any, force: Any, inertia: Any, damping: Any, step: Any) -> Any:
-    """The engine's velocity, half a step before the position, from that at its time; back from
-    `whole`.
+    """Return the engine's velocity, half a step before the position; inverse of `whole`.
+
+    Args:
+        v: velocity at the time of the position.
+        force: force at the position.
+        inertia: generalised inertia.
+        damping: viscous damping.
+        step: step size in seconds.
     """
     half = 0.5 * step / inertia
     return (1.0 + half * damping) * v - half * force  # (7)
 
 
 def turning(felt: Any, u: Any, inertia: Any, damping: Any, step: Any) -> Any:
-    """The force over the step in which the input goes from `felt` to `u`."""
+    """Return the force over the step in which the input changes, equation (8).
+
+    Args:
+        felt: force of the input before the change.
+        u: force of the input after the change.
+        inertia: generalised inertia.
+        damping: viscous damping.
+        step: step size in seconds.
+    """
     return u + (0.5 - 0.25 * step * damping / inertia) * (felt - u)  # (8)
 
 
 def _driven(joint: Joint, lane: Lane, inertia: float, forces: Felt) -> Path:
-    """Whatever acts, asked for at each step."""
+    """Integrate with forces that are evaluated at each step."""
     x = float(lane.x[0])
     v = float(lane.v[0])
     t = 0.0
@@ -228,15 +283,15 @@ def _driven(joint: Joint, lane: Lane, inertia: float, forces: Felt) -> Path:
         if h != step:
             if not joint.pace(h, inertia, 0.0):
                 break
-            w = 2.0 * v - start  # so that the force put in is the force there is
+            w = 2.0 * v - start  # then the applied force equals the true force
             joint.place(x, w)
             step = h
         x, w = joint.advance((start - w) * inertia / h - forces.weight)  # (4), (2)
         if not math.isfinite(x + w):
             break
         t += h
-        # Forces are asked for where the velocity would be without a change of force: w lies in the
-        # middle between v and that.
+        # Forces are evaluated at the velocity without a change of force: w is the mean of v and
+        # that velocity.
         forces.look(t, x, 2.0 * w - v)
         v = forces.end(w, h)  # (3)
         if i + 1 in kept:
@@ -248,7 +303,7 @@ def _driven(joint: Joint, lane: Lane, inertia: float, forces: Felt) -> Path:
 
 
 def _weights(lane: Lane, x: Array) -> Array:
-    """(n,) gravity's force at positions (n,)."""
+    """Return the force of gravity (n,) at positions (n,)."""
     nothing = np.zeros((x.size, 1))
     moment = lane.moment(nothing, x[:, None], nothing, {})
     weights: Array = lane.system.weight(moment)[:, 0]
@@ -256,6 +311,6 @@ def _weights(lane: Lane, x: Array) -> Array:
 
 
 def failed(lane: Lane) -> Path:
-    """No motion."""
+    """Return a trajectory of NaN for a failed element."""
     nothing = np.full((lane.kept.size, 1), np.nan)
     return nothing, nothing, nothing

@@ -1,4 +1,4 @@
-"""The forces on one coordinate at an instant, for `sims.engines.joint`."""
+"""Forces on one joint, linearised in the velocity, for `sims.engines.joint`."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from sims.engines.forces import Forces, kick, rate
 from sims.engines.scalar import Resistance
 
 NUDGE = 1e-3
-"""Change of velocity (m/s or rad/s) over which the slope of the force is taken."""
+"""Velocity difference (m/s or rad/s) used to compute the slope of the force."""
 
 
 class Felt(ABC):
-    """The forces on one coordinate, linear in the velocity about the last look.
+    """Forces on one coordinate, linear in the velocity around the last evaluation.
 
     Attributes:
-        weight: the engine's own, where last looked.
-        limit: of dry friction.
+        weight: force of the engine's own gravity at the last evaluation.
+        limit: limit of dry friction.
     """
 
     def __init__(self, gravity: Callable[[float], float], inertia: float) -> None:
@@ -32,33 +32,38 @@ class Felt(ABC):
 
     @abstractmethod
     def feel(self, i: int) -> bool:
-        """Set the inputs of step i; whether any differs from the step before."""
+        """Set the inputs of step i; return whether any input differs from the previous step."""
 
     @abstractmethod
     def look(self, t: float, x: float, v: float) -> None:
-        """Ask for all forces at this instant."""
+        """Evaluate all forces at this state and linearise them in the velocity."""
 
     def force(self, v: float) -> float:
-        """Gravity and all but friction, at a velocity near the one looked at."""
+        """Return gravity and all forces except dry friction, near the evaluated velocity."""
         return self._force + self._slope * (v - self._at)
 
     def end(self, w: float, step: float) -> float:
-        """The velocity half a step after `w`, the force being the one at its end; a growing force
-        is taken as is.
+        """Return the velocity half a step after `w`, with the force at the end of the half step.
+
+        A force that increases with the velocity is taken without its slope.
+
+        Args:
+            w: the engine's velocity.
+            step: step size in seconds.
         """
-        # (3) with f linear in v about the last look: its slope goes over to the inertia's side,
-        # which a growing force would make smaller, down to nothing.
+        # Equation (3) with f linear in v: the slope is added to the inertia. An increasing force
+        # would reduce this inertia, possibly to zero.
         slope = min(self._slope, 0.0)
         force = self._force + slope * (w - self._at)
         return kick(w, force, self.limit, 1.0 / (self._inertia - 0.5 * step * slope), 0.5 * step)
 
     def acceleration(self, v: float) -> float:
-        """Of the smooth motion; zero where friction holds."""
+        """Return the acceleration of the smooth motion; zero where dry friction holds the body."""
         return rate(v, self.force(v), self.limit) / self._inertia
 
 
 class Asked(Felt):
-    """Whatever the system and the effects say, at two velocities for the slope between them."""
+    """Forces evaluated by calling system and effects, at two velocities to get the slope."""
 
     def __init__(self, gravity: Callable[[float], float], lane: Lane, inertia: float) -> None:
         super().__init__(gravity, inertia)
@@ -66,20 +71,20 @@ class Asked(Felt):
         self._signals = {name: values.tolist() for name, values in lane.inputs.items()}
 
     def feel(self, i: int) -> bool:
-        """See `Felt`."""
-        # The first step has none before it, not even an equal one.
+        """Set the inputs of step i; return whether any input differs from the previous step."""
+        # The first step has no previous step, so that its inputs always count as changed.
         changed = i == 0 or any(values[i] != values[i - 1] for values in self._signals.values())
         if changed:
             self._ask.feel({name: values[i] for name, values in self._signals.items()})
         return changed
 
     def look(self, t: float, x: float, v: float) -> None:
-        """See `Felt`."""
+        """Evaluate all forces at this state and linearise them in the velocity."""
         moment = self._ask.moment
         moment.t.fill(t)
         moment.x.fill(x)
         moment.v[0, 0] = v
-        # Away from rest, where forces may jump.
+        # The second velocity is farther from zero, where forces may be discontinuous.
         nudge = copysign(NUDGE, v)
         moment.v[1, 0] = v + nudge
         force, nudged = self._ask.force()[:, 0].tolist()
@@ -91,7 +96,7 @@ class Asked(Felt):
 
 
 class Known(Felt):
-    """An input that acts as it is, and what opposes motion in plain numbers."""
+    """Forces in closed form: an unmodified input, and resistance laws of the speed."""
 
     def __init__(
         self, gravity: Callable[[float], float], lane: Lane, inertia: float, opposing: Resistance
@@ -103,13 +108,13 @@ class Known(Felt):
         self.limit = opposing.limit
 
     def feel(self, i: int) -> bool:
-        """See `Felt`."""
+        """Set the input of step i; return whether it differs from the previous step."""
         before = self._felt
         self._felt = self._drive[i]
         return bool(self._felt != before)
 
     def look(self, t: float, x: float, v: float) -> None:  # noqa: ARG002
-        """See `Felt`."""
+        """Evaluate all forces at this state and linearise them in the velocity."""
         opposed, slope = self._resistance(abs(v))
         self.weight = self._gravity(x)
         self._at = v
@@ -118,7 +123,7 @@ class Known(Felt):
 
 
 def drive_of(lane: Lane) -> Array:
-    """(S,) generalised force of the inputs over each step, at least one value."""
+    """Return the generalised force (S,) of the inputs over each step, at least one value."""
     if not lane.inputs:
         return np.zeros(max(lane.steps.size, 1))
     signals = {name: values[:, None] for name, values in lane.inputs.items()}

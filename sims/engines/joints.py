@@ -1,7 +1,7 @@
-"""Many lanes of one coordinate at once: `sims.engines.joint` with arrays in place of numbers.
+"""Integrate many one-coordinate systems together: `sims.engines.joint` with arrays.
 
-What each lane comes to is the same as alone, to the bit. Lanes stand in the order of their number
-of steps, most first, so that those which are still under way are the first ones.
+Each batch element gets the same result as when it is integrated alone, bit for bit. Elements are
+sorted by their number of steps, largest first, so that the unfinished ones are always the first.
 """
 
 from __future__ import annotations
@@ -22,66 +22,82 @@ from sims.engines.timetable import Table, filled
 
 
 class Joints(Protocol):
-    """As many bodies as there are lanes, each on one hinge or guide, in an engine that steps them
-    together.
-    """
+    """Bodies on one hinge or guide each, one per batch element, that an engine steps together."""
 
     open_loop: bool
     """Whether the system's drive depends on its inputs alone."""
     fewest: Mapping[str, int]
-    """Lanes from which on together is quicker, by what acts: ``open``, where the engine runs on its
-    own over all of the run; ``stretches``, where it does so between changes of the step; ``known``,
-    where forces are written out; ``asked``, where effects are asked. It never is where none is
-    said."""
+    """Minimum number of batch elements for which integration together is faster, by kind.
+
+    The kinds are ``open`` (the engine runs on its own over the whole run), ``stretches`` (the
+    engine runs on its own between changes of the step size), ``known`` (forces have closed-form
+    laws) and ``asked`` (effects are evaluated at each step). A kind that is missing is never faster
+    together.
+    """
     most: int
-    """Lanes of which together no more are quicker."""
+    """Maximum number of batch elements for which integration together is faster."""
     alike: bool
-    """Whether lanes can be together only if they make the same steps."""
+    """Whether elements can be integrated together only if their steps are equal."""
 
     def start(self, constants: dict[str, float], count: int) -> None:
-        """Make the world ready for this many lanes of the same constants."""
+        """Prepare the world for `count` batch elements with equal constants."""
         ...
 
     def gravity(self, x: Array) -> Array:
-        """(n,) the generalised force that the engine itself applies at positions (n,)."""
+        """Return the generalised force (n,) of the engine's own gravity at positions (n,)."""
         ...
 
     def pace(self, lanes: Places, step: Array, inertia: Array, damping: Array) -> Mask:
-        """Set step, generalised inertia and damping, (n,), of some lanes; False where the engine
-        cannot represent the inertia.
+        """Set step, generalised inertia and damping of some batch elements.
+
+        Args:
+            lanes: (n,) indices of the elements.
+            step: (n,) step sizes in seconds.
+            inertia: (n,) generalised inertias.
+            damping: (n,) viscous joint dampings.
+
+        Returns:
+            (n,) False where the engine cannot represent the inertia.
 
         Raises:
-            ApartError: these lanes cannot share a world.
+            ApartError: these elements cannot share a world.
         """
         ...
 
     def place(self, lanes: Places, x: Array, w: Array) -> None:
-        """Set position and the engine's velocity of some lanes."""
+        """Set position (n,) and the engine's velocity (n,) of the elements `lanes` (n,)."""
         ...
 
     def state(self, count: int) -> tuple[Array, Array]:
-        """Positions and velocities (n,) of the first lanes; they follow what the engine does."""
+        """Return positions and velocities (n,) of the first `count` elements.
+
+        The arrays are views: they change when the engine steps.
+        """
         ...
 
     def advance(self, force: Array) -> None:
-        """Let the first lanes take one step with these forces (n,) beside gravity."""
+        """Advance the first n elements by one step with forces (n,) in addition to gravity."""
         ...
 
     def run(self, force: Array) -> tuple[Array, Array]:
-        """Let the first lanes take steps with forces (n, k); positions and velocities (n, k) after
-        each.
+        """Advance the first n elements by k steps with forces (n, k) in addition to gravity.
+
+        Returns:
+            Positions and velocities (n, k) after each step.
         """
         ...
 
     def again(self, failed: Mask) -> Mask:
-        """(L,) which lanes must be integrated by themselves for what has come about, where those
-        `failed` (L,) came to nothing.
+        """Return which batch elements (L,) must be integrated again, one by one.
+
+        Args:
+            failed: (L,) elements without a finite result.
         """
         ...
 
 
 class Company:
-    """Bodies on joints together; see `sims.engines.together.Company`."""
+    """Integrate bodies on joints together; see `sims.engines.together.Company`."""
 
     def __init__(self, joints: Joints) -> None:
         self._joints = joints
@@ -90,7 +106,7 @@ class Company:
         self.alike = joints.alike
 
     def kind(self, lane: Lane) -> str:
-        """See `Joints.fewest`."""
+        """Return the kind of a batch element; see `Joints.fewest`."""
         way = way_of(lane, self._joints.open_loop)
         if way.damping is not None:
             even = bool((lane.steps == lane.steps[0]).all())
@@ -98,10 +114,16 @@ class Company:
         return "asked" if way.opposing is None else "known"
 
     def rollouts(self, lanes: Sequence[Lane]) -> list[Path | None]:
-        """See `sims.engines.together.Company`.
+        """Integrate batch elements together; see `sims.engines.together.Company`.
+
+        Args:
+            lanes: batch elements of one kind with equal constants.
+
+        Returns:
+            The trajectory of each element; None where it must be integrated by itself.
 
         Raises:
-            ApartError: they must be integrated one by one.
+            ApartError: the elements must be integrated one by one.
         """
         order = sorted(range(len(lanes)), key=lambda i: -lanes[i].steps.size)
         chosen = [lanes[i] for i in order]
@@ -121,17 +143,17 @@ class Company:
 
 
 class _Run(Protocol):
-    """An integration of lanes."""
+    """Integration of several batch elements."""
 
     def paths(self) -> list[Path]:
-        """The motion of each."""
+        """Return the trajectory of each batch element."""
         ...
 
 
 class _Open:
-    """No feedback from the motion but viscous damping; see `joint`.
+    """Integration without feedback except viscous damping; see `joint`.
 
-    The engine gets all steps of one length at once.
+    The engine receives all steps of equal length in one call.
     """
 
     def __init__(self, joints: Joints, lanes: Sequence[Lane], damping: Array) -> None:
@@ -147,7 +169,7 @@ class _Open:
         self._rows[0, :, 3] = self._drive[:, 0]
 
     def paths(self) -> list[Path]:
-        """See `_Run`."""
+        """Return the trajectory of each batch element."""
         for begin, end, count in self._table.phases():
             borders = begin + np.flatnonzero(self._table.paced[begin:end])
             ends = [*borders[borders > begin].tolist(), end]
@@ -156,7 +178,7 @@ class _Open:
         return [self._path(i) for i in range(len(self._lanes))]
 
     def _stretch(self, begin: int, end: int, count: int) -> None:
-        """Steps in which no lane's length of step changes."""
+        """Advance through steps in which the step size of no batch element changes."""
         u = self._drive[:count, begin:end]
         before = self._drive[:count, max(begin - 1, 0) : end - 1]
         if not begin:
@@ -167,7 +189,7 @@ class _Open:
         force = np.where(u == before, u, turned)
         if self._table.paced[begin]:
             new = self._pace(begin, count)
-            force[new, 0] = u[new, 0]  # a lane that is placed anew has no step behind it
+            force[new, 0] = u[new, 0]  # a newly placed element has no previous step
         x, w = self._joints.run(force)
         rows = self._table.rows[begin + 1 : end + 1]
         kept = np.flatnonzero(rows >= 0)
@@ -179,7 +201,7 @@ class _Open:
         self._rows[rows[kept], :count] = to
 
     def _pace(self, begin: int, count: int) -> Places:
-        """Set the lengths of step that are new; whose they are."""
+        """Set the step sizes that change at step `begin`; return the indices of these elements."""
         h = self._table.steps[:count, begin]
         inertia = self._inertia[:count]
         damping = self._damping[:count]
@@ -187,7 +209,7 @@ class _Open:
             old = self._table.steps[:count, begin - 1]
             new = np.flatnonzero(h != old)
             x, w = (values[new] for values in self._joints.state(count))
-            # What has failed is put back to where it began, and is not looked at again.
+            # A failed element is put back to its initial position, and its result is discarded.
             bad = ~np.isfinite(x + w)
             self._failed[new[bad]] = True
             x = np.where(bad, self._rows[0, new, 0], x)
@@ -214,7 +236,7 @@ class _Open:
 
 
 class _Driven:
-    """Whatever acts, asked for at each step; see `joint`."""
+    """Integration that evaluates all forces at each step; see `joint`."""
 
     def __init__(self, joints: Joints, lanes: Sequence[Lane], felt: Felt) -> None:
         self._joints = joints
@@ -231,7 +253,7 @@ class _Driven:
         self._rows = np.full((3, self._table.kept, len(lanes)), np.nan)
 
     def paths(self) -> list[Path]:
-        """See `_Run`."""
+        """Return the trajectory of each batch element."""
         every = np.arange(len(self._lanes))
         self._joints.place(every, self._start, np.zeros(every.size))
         self._felt.look(self._t, self._start, self._v)
@@ -243,7 +265,7 @@ class _Driven:
         return [self._path(i) for i in range(len(self._lanes))]
 
     def _only(self, count: int) -> None:
-        """Go on with the first lanes."""
+        """Continue with the first `count` batch elements only."""
         self._x, self._w = self._joints.state(count)
         self._v = self._v[:count]
         self._t = self._t[:count]
@@ -264,7 +286,7 @@ class _Driven:
             self._pace(k, start)
         push = (start - self._w) * self._inertia / self._h - felt.weight  # (4)
         self._joints.advance(push)  # (2)
-        # Any number that is not finite makes this product one that is not.
+        # The product is not finite if any of the numbers is not finite.
         if not math.isfinite(np.dot(self._x, self._w)):
             self._set_aside()
         self._t = self._t + self._h
@@ -274,19 +296,20 @@ class _Driven:
             self._keep(self._table.rows[k + 1], self._x)
 
     def _pace(self, k: int, start: Array) -> None:
-        """Set the lengths of step that are new."""
+        """Set the step sizes that change at step `k`."""
         new = np.arange(self._t.size)
         if k:
             new = np.flatnonzero(self._h != self._table.steps[: self._t.size, k - 1])
         inertia = self._inertia[new]
         able = self._joints.pace(new, self._h[new], inertia, np.zeros(new.size))
         self._failed[new[~able]] = True
-        # So that the force put in is the force there is.
+        # With this velocity, the applied force equals the true force.
         self._joints.place(new, self._x[new], 2.0 * self._v[new] - start[new])
 
     def _set_aside(self) -> None:
-        """Put what has failed back to where it began: effects are asked about nothing that is no
-        number, and what becomes of it is not looked at.
+        """Put failed elements back to their initial position and discard their results.
+
+        Otherwise, effects would be evaluated with numbers that are not finite.
         """
         bad = np.flatnonzero(~np.isfinite(self._x + self._w))
         self._failed[bad] = True

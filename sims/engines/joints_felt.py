@@ -1,5 +1,6 @@
-"""The forces on many lanes of one coordinate, linear in the velocity about the last look: those of
-`sims.engines.joint` with arrays in place of numbers.
+"""Forces on many one-coordinate elements, linearised in the velocity.
+
+The module contains the forces of `sims.engines.joint_felt` with arrays instead of numbers.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from sims.engines.joint_felt import NUDGE, drive_of
 from sims.engines.scalar import resistances
 
 Seen = tuple[Array, Array | None, Array, Array]
-"""Weight, limit of dry friction, force and its slope in the velocity, (n,) each."""
+"""Weight, limit of dry friction, force and its slope in the velocity, each (n,)."""
 
 
 class Felt(ABC):
-    """What a look gave, for n lanes.
+    """Forces on n batch elements, linear in the velocity around the last evaluation.
 
     Attributes:
-        weight: (n,) the engine's own, where last looked.
-        limit: (n,) of dry friction; None where no lane has any.
+        weight: (n,) force of the engine's own gravity at the last evaluation.
+        limit: (n,) limits of dry friction; None where no element has any.
     """
 
     def __init__(self, gravity: Callable[[Array], Array], lanes: Sequence[Lane]) -> None:
@@ -37,16 +38,21 @@ class Felt(ABC):
 
     @abstractmethod
     def feel(self, k: int, t: Array, x: Array, v: Array) -> None:
-        """Set the inputs of step k; lanes whose inputs differ from the step before look again, at
-        this instant.
+        """Set the inputs of step k and re-evaluate the elements whose inputs have changed.
+
+        Args:
+            k: index of the step.
+            t: (n,) times in seconds.
+            x: (n,) positions.
+            v: (n,) velocities.
         """
 
     @abstractmethod
     def _see(self, t: Array, x: Array, v: Array) -> Seen:
-        """Ask for all forces at these instants."""
+        """Evaluate all forces at these states."""
 
     def only(self, count: int) -> None:
-        """Go on with the first lanes."""
+        """Continue with the first `count` elements only."""
         self._lanes = self._lanes[:count]
         self.weight = self.weight[:count]
         self.limit = None if self.limit is None else self.limit[:count]
@@ -55,12 +61,18 @@ class Felt(ABC):
         self._slope = self._slope[:count]
 
     def look(self, t: Array, x: Array, v: Array) -> None:
-        """Ask for all forces at these instants, (n,) each."""
+        """Evaluate all forces at these states and linearise them in the velocity.
+
+        Args:
+            t: (n,) times in seconds.
+            x: (n,) positions.
+            v: (n,) velocities.
+        """
         self._at = v
         self.weight, self.limit, self._force, self._slope = self._see(t, x, v)
 
     def _look_again(self, where: Array, t: Array, x: Array, v: Array) -> None:
-        """Ask for all forces of some lanes, where `where` (n,) is True."""
+        """Evaluate all forces again for the elements where `where` (n,) is True."""
         weight, limit, force, slope = self._see(t, x, v)
         self._at = np.where(where, v, self._at)
         self.weight = np.where(where, weight, self.weight)
@@ -70,24 +82,33 @@ class Felt(ABC):
             self.limit = np.where(where, limit, self.limit)
 
     def force(self, v: Array) -> Array:
-        """(n,) gravity and all but friction, at velocities near those looked at."""
+        """Return gravity and all forces except dry friction (n,), near the evaluated velocities."""
         return self._force + self._slope * (v - self._at)
 
     def end(self, w: Array, half: Array, inertia: Array) -> Array:
-        """(n,) velocities half a step, `half`, after `w`; see `joint`."""
+        """Return the velocities half a step after `w`, with the force at the end; see `joint_felt`.
+
+        Args:
+            w: (n,) the engine's velocities.
+            half: (n,) half step sizes in seconds.
+            inertia: (n,) generalised inertias.
+
+        Returns:
+            Velocities (n,).
+        """
         slope = np.minimum(self._slope, 0.0)
         force = self._force + slope * (w - self._at)
         return kicks(w, force, self.limit, 1.0 / (inertia - half * slope), half)
 
 
 class Asked(Felt):
-    """Whatever the system and the effects say, at two velocities for the slope between them."""
+    """Forces evaluated by calling system and effects, at two velocities to get the slope."""
 
     def __init__(self, gravity: Callable[[Array], Array], lanes: Sequence[Lane]) -> None:
         super().__init__(gravity, lanes)
         names = lanes[0].inputs
         size = max((lane.inputs[name].size for lane in lanes for name in names), default=1)
-        # (S, lanes), so that the values of a step lie together.
+        # The shape is (S, lanes), so that the values of one step are contiguous in memory.
         self._signals = {name: _columns([lane.inputs[name] for lane in lanes]) for name in names}
         changes = np.zeros((size, len(lanes)), dtype=bool)
         for values in self._signals.values():
@@ -97,7 +118,7 @@ class Asked(Felt):
         self._ask = Forces(lanes, 2)
 
     def only(self, count: int) -> None:
-        """See `Felt`."""
+        """Continue with the first `count` elements only."""
         if count < len(self._lanes):
             super().only(count)
             self._ask = Forces(self._lanes, 2)
@@ -107,7 +128,7 @@ class Asked(Felt):
             self._set(self._step)
 
     def feel(self, k: int, t: Array, x: Array, v: Array) -> None:
-        """See `Felt`."""
+        """Set the inputs of step k and re-evaluate the elements whose inputs have changed."""
         self._step = k
         if k in self._turns:
             self._set(k)
@@ -124,7 +145,7 @@ class Asked(Felt):
             moment.t[half, 0] = t
             moment.x[half, 0] = x
             moment.v[half, 0] = v
-        # Away from rest, where forces may jump.
+        # The second velocity is farther from zero, where forces may be discontinuous.
         nudge = np.copysign(NUDGE, v)
         moment.v[count:, 0] += nudge
         both = self._ask.force()[:, 0]
@@ -135,7 +156,7 @@ class Asked(Felt):
 
 
 class Known(Felt):
-    """An input that acts as it is, and what opposes motion by laws written out."""
+    """Forces in closed form: an unmodified input, and resistance laws of the speed."""
 
     def __init__(self, gravity: Callable[[Array], Array], lanes: Sequence[Lane]) -> None:
         super().__init__(gravity, lanes)
@@ -148,7 +169,7 @@ class Known(Felt):
         self.limit = self._opposing.limit
 
     def only(self, count: int) -> None:
-        """See `Felt`."""
+        """Continue with the first `count` elements only."""
         super().only(count)
         self._drive = self._drive[:, :count]
         self._changes = self._changes[:, :count]
@@ -157,7 +178,7 @@ class Known(Felt):
         self._opposing = self._opposing.first(count)
 
     def feel(self, k: int, t: Array, x: Array, v: Array) -> None:
-        """See `Felt`."""
+        """Set the input of step k and re-evaluate the elements whose input has changed."""
         if k in self._turns:
             self._now = self._drive[k]
             self._look_again(self._changes[k], t, x, v)
@@ -169,12 +190,12 @@ class Known(Felt):
 
 
 def _rows_with(where: NDArray[np.bool_]) -> set[int]:
-    """The rows of (S, L) in which any value is True."""
+    """Return the indices of the rows of (S, L) in which any value is True."""
     return set(np.flatnonzero(where.any(axis=1)).tolist())
 
 
 def _columns(rows: Sequence[Array]) -> Array:
-    """Rows of several sizes as (S, L), the last value of a shorter one over and over."""
+    """Stack rows of different sizes as columns (S, L); repeat the last value of shorter ones."""
     size = max(row.size for row in rows)
     result = np.empty((size, len(rows)))
     for i, row in enumerate(rows):

@@ -1,7 +1,7 @@
-"""MuJoCo as an engine: forces through ``qfrc_applied``, impacts through its contact solver.
+"""MuJoCo engine: forces through ``qfrc_applied``, impacts through its contact solver.
 
-The world that carries a system is written by the module ``mujoco_world`` beside the system's own;
-`sims.engines.worlds` states what such a module must have.
+The module ``mujoco_world`` in the system's package writes the world of a system; its interface is
+specified in `sims.engines.worlds`.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from sims.system import Engine, Lanes, Motion, System
 REQUIRES = ("mujoco",)
 
 _STIFFNESS = 1e5
-"""1/s^2, of `native_contact` where the user sets none: contacts then last 10 ms."""
+"""Default stiffness of the native contact in 1/s^2: contacts then last 10 ms."""
 _MOST_THREADS = 1024
 _OWN_STEP = 2e-3
-"""Seconds: the step that MuJoCo takes by default."""
+"""MuJoCo's default time step in seconds."""
 
 
 def engine(
@@ -47,21 +47,25 @@ def engine(
     stiffness: float | None = None,
     threads: int = 1,
 ) -> Engine:
-    """The engine for one simulator.
+    """Make the MuJoCo engine for one simulator.
 
     Args:
-        system: what it will integrate.
+        system: system that the engine will integrate.
         time_step: longest step in seconds (2 ms with `native_contact`); each sampling interval is
             divided into equal steps not longer than this.
-        native_contact: for a system that bounces: MuJoCo's contact as a spring and damper that give
-            way, whose damping is chosen for the restitution; stepped and read at first order
+        native_contact: for a bouncing system: use MuJoCo's soft contact, a spring and a damper
+            whose damping is chosen for the restitution, stepped and read at first order
             (`sims.engines.native`).
-        stiffness: with `native_contact`: of the contact, 1/s^2 (1e5, that is contacts of 10 ms).
-        threads: over which lanes that are stepped together are spread; results do not depend on
-            it. One is right where other processes use the other cores.
+        stiffness: with `native_contact`: stiffness of the contact in 1/s^2 (1e5: contacts of 10
+            ms).
+        threads: number of threads for batch elements that are stepped together; the results do not
+            depend on it. Use 1 if other processes use the other cores.
+
+    Returns:
+        The engine.
 
     Raises:
-        InputError: an impossible setting.
+        InputError: a setting is not valid.
     """
     if native_contact and time_step is None:
         time_step = _OWN_STEP
@@ -85,16 +89,18 @@ def engine(
 
 
 class _Closed(Protocol):
-    """What is closed with the engine."""
+    """Object that is closed together with the engine."""
 
     def close(self) -> None:
-        """Give back what is kept."""
+        """Release stored worlds."""
         ...
 
 
 class MujocoEngine:
-    """MuJoCo: lanes together where there is `mujoco.batch` and they are enough, else one after the
-    other in one world.
+    """MuJoCo engine for one system.
+
+    Batch elements are integrated together if `mujoco.batch` is available and there are enough of
+    them, otherwise one after the other in one world.
     """
 
     name: str = "mujoco"
@@ -128,13 +134,13 @@ class MujocoEngine:
             self._together(on_joint, bodies, joints.Company(bodies))
 
     def _alone(self, rollout: Callable[[Lane], Path]) -> None:
-        """Integrate lane after lane."""
+        """Set up integration of one element after the other."""
         self._rollouts = partial(in_turn, rollout, self.close)
 
     def _together(
         self, alone: Callable[[Lane], Path], many: _Closed, company: together.Company
     ) -> None:
-        """Integrate lanes together, if this MuJoCo does."""
+        """Set up integration of elements together, if this MuJoCo version can step batches."""
         if not mujoco_batch.there():
             self._alone(alone)
             return
@@ -142,17 +148,17 @@ class MujocoEngine:
         self._rollouts = partial(together.rollouts, alone, company, self.close)
 
     def integrate(self, lanes: Lanes) -> Motion:
-        """See `Engine`."""
+        """Integrate all batch elements; see `Engine`."""
         assert self._rollouts is not None, "a system that the engine refuses"
         with _quiet():
             return integrate(lanes, self._rollouts, self.close)
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
-        """See `Engine`."""
+        """Return why the engine cannot integrate the system; see `Engine`."""
         return self._reason
 
     def close(self) -> None:
-        """Give back the MuJoCo world; the next integration makes a new one."""
+        """Release the MuJoCo worlds; the next integration makes new ones."""
         if self._rollouts is not None:
             self._world.close()
         if self._many is not None:
@@ -161,8 +167,9 @@ class MujocoEngine:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without MuJoCo's warnings of instability, which it would write to a file: such lanes become
-    NaN.
+    """Suppress MuJoCo's warnings of instability, which it would write to a file.
+
+    Unstable batch elements become NaN.
     """
     mujoco = library()
     before = mujoco.get_mju_user_warning()
@@ -174,4 +181,4 @@ def _quiet() -> Iterator[None]:
 
 
 def _ignore(message: str) -> None:
-    """Nothing."""
+    """Ignore a warning."""

@@ -1,4 +1,4 @@
-"""Balls in MuJoCo, many at once: `mujoco.batch.Batch`."""
+"""Many balls in MuJoCo, stepped together with `mujoco.batch.Batch`."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Balls:
     """Balls over level ground; see `sims.engines.flights.Balls`.
 
     Args:
-        world: whose model the lanes share.
-        threads: over which lanes are spread; the results do not depend on it.
+        world: world whose model the elements share.
+        threads: number of threads; the results do not depend on it.
     """
 
     fewest: Mapping[str, int] = FEWEST
@@ -33,7 +33,7 @@ class Balls:
         self._worlds: dict[object, _World] = {}
 
     def start(self, constants: dict[str, float], count: int) -> FlyingBall:
-        """See `sims.engines.flights.Balls`."""
+        """Prepare the world for `count` elements; see `sims.engines.flights.Balls`."""
         self._mass = constants["mass"]
         self._ball.start(constants)
         key = (*constants.items(), count)
@@ -46,39 +46,39 @@ class Balls:
         return self._ball
 
     def pace(self, lanes: Places, step: Array) -> None:
-        """See `sims.engines.flights.Balls`."""
+        """Set the steps of some elements; see `sims.engines.flights.Balls`."""
         self._now.step[lanes] = step
         for i, h in zip(lanes.tolist(), step.tolist(), strict=True):
             if self._now.held[i]:
                 self._now.contact[i] = self._ball.holding(h)
 
     def place(self, lanes: Places, x: Array, w: Array) -> None:
-        """See `sims.engines.flights.Balls`."""
+        """Set position and velocity of some elements; see `sims.engines.flights.Balls`."""
         self._now.x[lanes] = x
         self._now.w[lanes] = w
 
     def state(self, count: int) -> tuple[Array, Array]:
-        """See `sims.engines.flights.Balls`."""
+        """Return states of the first elements; see `sims.engines.flights.Balls`."""
         return self._now.x[:count], self._now.w[:count]
 
     def advance(self, lanes: Places, force: Array) -> None:
-        """See `sims.engines.flights.Balls`."""
+        """Advance some elements by one step; see `sims.engines.flights.Balls`."""
         self._now.force[lanes] = self._mass * force
         self._now.batch.step(lanes)
 
     def lend(self, lane: int) -> None:
-        """See `sims.engines.flights.Balls`."""
+        """Copy the contact state of an element to the separate ball."""
         self._ball.be(bool(self._now.held[lane]), self._now.before[lane])
 
     def take_back(self, lane: int) -> None:
-        """See `sims.engines.flights.Balls`."""
+        """Copy the contact state of the separate ball back to an element."""
         held, flags, before = self._ball.became
         self._now.held[lane] = held
         self._now.flags[lane] = flags
         self._now.before[lane] = before
 
     def close(self) -> None:
-        """Give back what is kept."""
+        """Release stored worlds."""
         self._worlds.clear()
         self.__dict__.pop("_now", None)
 
@@ -87,17 +87,18 @@ class Balls:
 
 
 class _World:
-    """A batch of as many balls.
+    """Batch of balls.
 
     Attributes:
-        step: (L,) seconds.
-        contact: (L, G, 2) of each geom, as MuJoCo's ``solref``.
-        flags: (L,) what is disabled.
-        held: (L,) whether contact holds the ball up.
+        step: (L,) step sizes in seconds.
+        contact: (L, G, 2) contact parameters of each geom, as MuJoCo's ``solref``.
+        flags: (L,) disable flags.
+        held: (L,) whether contact supports the ball.
         x: (L, 3) positions.
         w: (L, 3) velocities.
-        force: (L, 3) newtons beside gravity.
-        before: (L, 3) the acceleration of the step before, from which MuJoCo's solver begins.
+        force: (L, 3) applied forces in newtons, in addition to gravity.
+        before: (L, 3) acceleration of the previous step, with which MuJoCo's solver is
+            warm-started.
     """
 
     def __init__(self, model: Any, count: int, threads: int) -> None:
@@ -114,6 +115,6 @@ class _World:
         self.before: Array = self.batch.bind("qacc_warmstart")
 
     def reset(self) -> None:
-        """All balls as newly made, without contact."""
+        """Reset all balls to their initial state, without contact."""
         self.batch.reset(stage=int(library().mjtStage.mjSTAGE_NONE))
         self.held[:] = False

@@ -1,8 +1,8 @@
-"""Bodies on joints in MuJoCo, many at once: `mujoco.batch.Batch`, where this MuJoCo has it.
+"""Many bodies on joints in MuJoCo: `mujoco.batch.Batch`, if this MuJoCo version has it.
 
-A world module's `load` writes into one compiled model (`sims.engines.worlds`). What it wrote is
-found by comparing the model's binary form with what it was before, and goes into the fields that
-the batch keeps for each lane.
+The function `load` of a world module writes into one compiled model (`sims.engines.worlds`). The
+fields that it wrote are found by comparing the model's binary form before and after, and their
+values are stored in the batch's fields for each element.
 """
 
 from __future__ import annotations
@@ -22,20 +22,23 @@ from sims.engines.mujoco_bodies import CompiledWorld, library
 from sims.engines.worlds import MujocoJointModule
 
 _UNINTERRUPTED = 40_000
-"""Steps of all lanes together in one call: a tenth of a second, after which Ctrl-C is heard."""
+"""Maximum number of steps of all elements in one call.
+
+They take a tenth of a second, after which Ctrl-C can take effect.
+"""
 
 FEWEST = {"open": 1, "stretches": 16, "known": 24, "asked": 5}
 MOST = 256
-"""Lanes of a batch: of more, what is held for them leaves the processor's cache."""
+"""Maximum number of elements in a batch: with more, the data exceed the processor's cache."""
 KEPT = 4
-"""Worlds of other constants or numbers of lanes that are kept."""
+"""Maximum number of cached worlds with different constants or numbers of elements."""
 
 Bytes = NDArray[np.uint8]
 
 
 @functools.cache
 def there() -> bool:
-    """Whether this MuJoCo steps batches; it is not imported."""
+    """Return whether this MuJoCo version can step batches, without importing it."""
     found = find_spec("mujoco")
     folders = found.submodule_search_locations if found else None
     return any((Path(folder) / "batch.py").exists() for folder in folders or ())
@@ -45,9 +48,9 @@ class Joints:
     """Bodies on one hinge or guide each; see `sims.engines.joints.Joints`.
 
     Args:
-        world: whose model the lanes share.
-        module: the system's ``mujoco_world``.
-        threads: over which lanes are spread; the results do not depend on it.
+        world: world whose model the elements share.
+        module: module ``mujoco_world`` of the system.
+        threads: number of threads; the results do not depend on it.
     """
 
     fewest: Mapping[str, int] = FEWEST
@@ -60,11 +63,12 @@ class Joints:
         self._gravity = module.gravity
         self._threads = threads
         self.open_loop: bool = module.OPEN_LOOP
-        # By constants and number of lanes; making one costs as much as a few hundred steps.
+        # Worlds by constants and number of elements; making one costs as much as a few hundred
+        # steps.
         self._worlds: dict[object, _World] = {}
 
     def start(self, constants: dict[str, float], count: int) -> None:
-        """A world for these constants, as newly made."""
+        """Prepare a world for these constants and `count` elements, in its initial state."""
         self._constants = constants
         self._weigh = self._gravity(constants)
         key = (*constants.items(), count)
@@ -79,12 +83,12 @@ class Joints:
         self._count = count
 
     def gravity(self, x: Array) -> Array:
-        """See `sims.engines.joints.Joints`."""
-        # The very function that one lane asks: NumPy's sine may round otherwise.
+        """Return the generalised force of gravity (n,) at positions (n,)."""
+        # The same function as for one element is used, because NumPy's sine may round differently.
         return np.array([self._weigh(value) for value in x.tolist()])
 
     def pace(self, lanes: Places, step: Array, inertia: Array, damping: Array) -> Mask:
-        """See `sims.engines.joints.Joints`."""
+        """Set step, inertia and damping of some elements; see `sims.engines.joints.Joints`."""
         world = self._now
         world.step[lanes] = step
         world.damping[lanes, 0] = damping
@@ -97,21 +101,21 @@ class Joints:
         return able
 
     def place(self, lanes: Places, x: Array, w: Array) -> None:
-        """See `sims.engines.joints.Joints`."""
+        """Set position and velocity of some elements; see `sims.engines.joints.Joints`."""
         self._now.x[lanes, 0] = x
         self._now.w[lanes, 0] = w
 
     def state(self, count: int) -> tuple[Array, Array]:
-        """See `sims.engines.joints.Joints`."""
+        """Return states of the first elements; see `sims.engines.joints.Joints`."""
         return self._now.x[:count, 0], self._now.w[:count, 0]
 
     def advance(self, force: Array) -> None:
-        """See `sims.engines.joints.Joints`."""
+        """Advance the first elements by one step; see `sims.engines.joints.Joints`."""
         self._now.force[: force.size, 0] = force
         self._now.batch.step(self._ids(force.size))
 
     def run(self, force: Array) -> tuple[Array, Array]:
-        """See `sims.engines.joints.Joints`."""
+        """Advance the first elements by several steps; see `sims.engines.joints.Joints`."""
         self._ran = True
         lanes, steps = force.shape
         x = np.empty(force.shape)
@@ -129,15 +133,15 @@ class Joints:
         return x, w
 
     def again(self, failed: Mask) -> Mask:
-        """See `sims.engines.joints.Joints`."""
+        """Return which elements must be integrated again; see `sims.engines.joints.Joints`."""
         if not self._ran:
             return np.zeros(failed.size, dtype=bool)
-        # A run ends where MuJoCo warns, though it might go on.
+        # A batch rollout ends where MuJoCo warns, although a single element might continue.
         warned: Mask = (self._now.batch.warning[:, :, 1] > 0).any(axis=1)
         return warned
 
     def close(self) -> None:
-        """Give back what is kept."""
+        """Release stored worlds."""
         self._worlds.clear()
         self.__dict__.pop("_now", None)
 
@@ -150,16 +154,16 @@ class Joints:
 
 
 class _World:
-    """A batch of as many lanes, and one model that a world module loads.
+    """Batch of elements, and one model into which the world module writes the inertia.
 
     Attributes:
-        model: what `load` writes into, before it goes to a lane.
-        loaded: (L,) inertia of each lane; NaN where none is loaded.
-        step: (L,) seconds.
-        damping: (L, 1) of the joint.
+        model: model that `load` writes into before the values are copied to an element.
+        loaded: (L,) inertia of each element; NaN where none is set.
+        step: (L,) step sizes in seconds.
+        damping: (L, 1) joint damping.
         x: (L, 1) positions.
         w: (L, 1) velocities.
-        force: (L, 1) beside gravity.
+        force: (L, 1) applied forces in addition to gravity.
     """
 
     def __init__(self, model: Any, count: int, threads: int) -> None:
@@ -174,16 +178,16 @@ class _World:
         self.w: Array = self.batch.bind("qvel")
         self.force: Array = self.batch.bind("qfrc_applied")
         self._base = _binary(model)
-        # Fields that `load` writes, as the lanes have them.
+        # Model fields that `load` writes, with their values of all elements.
         self._fields: dict[str, Any] = {}
         self._covered = np.zeros(self._base.size, dtype=bool)
 
     def reset(self) -> None:
-        """All lanes as newly made."""
+        """Reset all elements to their initial state."""
         self.batch.reset(stage=int(library().mjtStage.mjSTAGE_NONE))
 
     def take(self, lane: int) -> None:
-        """Give a lane what has been loaded into the model."""
+        """Copy the values that `load` has written into the model to an element."""
         left = (_binary(self.model) != self._base) & ~self._covered
         if left.any():
             self._find(left)
@@ -191,7 +195,7 @@ class _World:
             values[lane] = getattr(self.model, name)
 
     def _find(self, changed: Mask) -> None:
-        """Find the fields to which these bytes belong."""
+        """Find the fields to which the changed bytes belong."""
         from mujoco import batch
 
         for name in sorted(batch.MODEL_FIELDS):
@@ -205,7 +209,7 @@ class _World:
 
 
 def _binary(model: Any) -> Bytes:
-    """A compiled model as bytes."""
+    """Return a compiled model as bytes."""
     mujoco = library()
     result = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
     mujoco.mj_saveModel(model, None, result)
@@ -213,7 +217,7 @@ def _binary(model: Any) -> Bytes:
 
 
 def _bytes_of(model: Any, name: str) -> Mask:
-    """Which bytes of the binary form are those of a field."""
+    """Return which bytes of the binary form belong to a field."""
     values = getattr(model, name)
     before = _binary(model)
     kept = values.copy()

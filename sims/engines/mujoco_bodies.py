@@ -1,26 +1,26 @@
-"""Bodies in MuJoCo: on a joint, and a ball over level ground.
+"""Single bodies in MuJoCo: a body on a joint, and a ball over level ground.
 
-MuJoCo's contact asks for an acceleration along the normal, of which it gives the share d: with r
-the depth, v its rate, and a_0 what would happen without contact,
+MuJoCo's contact computes a reference acceleration along the normal and applies the share d of it.
+With the penetration r, its rate v, and the acceleration a_0 without contact,
 
     a_ref = -b v - k r                                                     (1)
     a = (1 - d) a_0 + d a_ref, never pulling                               (2)
 
 ("Solver parameters", https://mujoco.readthedocs.io/en/stable/modeling.html#solver-parameters).
-Written as ``solref = (-stiffness, -damping)`` with constant impedance d and no stiffness, a_ref =
--(damping / d) v, so that with
+Written as ``solref = (-stiffness, -damping)`` with constant impedance d and zero stiffness, a_ref =
+-(damping / d) v. Therefore, with
 
     damping = (1 + e) / h                                                  (3)
 
-a single step of length h from the surface, other forces made up for (a_0 = 0), takes v to v - (1 +
-e) v = -e v: exactly the restitution e, for any h. A resting ball is held by
+a single step of length h from the surface, with other forces compensated (a_0 = 0), changes v to v
+- (1 + e) v = -e v: exactly the restitution e, for any h. A resting ball is supported with
 
     damping = 1 / h,    stiffness = 0.1 / h^2                              (4)
 
-which let it sink in by 10 (1 - d) g h^2. MuJoCo's friction is a convex
-relaxation that turns slip into lift (Todorov, ICRA 2014, doi:10.1109/ICRA.2014.6907751), so contact
-is frictionless here and the tangential speed lost in an impact goes in as an impulse, through
-``qfrc_applied`` in the step of the impact.
+which lets it sink in by 10 (1 - d) g h^2. MuJoCo's friction is a convex relaxation that turns slip
+into lift (Todorov, ICRA 2014, doi:10.1109/ICRA.2014.6907751). Therefore contact is frictionless
+here, and the tangential speed lost in an impact is applied as an impulse, through ``qfrc_applied``
+in the step of the impact.
 """
 
 from __future__ import annotations
@@ -35,15 +35,19 @@ from sims.engines.point import State, Vector
 from sims.engines.worlds import MujocoJointModule
 
 _IMPACT = 1e-4
-"""Seconds that the step of an impact lasts; MuJoCo takes accelerations above 1e10 for a failure."""
+"""Length of the time step of an impact in seconds.
+
+MuJoCo treats accelerations above 1e10 as a failure.
+"""
 _IMPEDANCE = 0.9999
-"""Share d of the acceleration asked for that contact gives: the largest MuJoCo allows."""
+"""Impedance d of the contact: the largest value that MuJoCo allows."""
 
 
 @functools.cache
 def library() -> Any:
-    """The module ``mujoco``, imported on first use: it takes a while and most commands never
-    simulate.
+    """Import the module ``mujoco`` on first use.
+
+    The import is slow, and most commands never simulate.
     """
     import mujoco
 
@@ -51,11 +55,10 @@ def library() -> Any:
 
 
 class CompiledWorld:
-    """One MuJoCo model and its state, compiled when first needed and again when the constants
-    change.
+    """MuJoCo model and its state, compiled on first use and again when the constants change.
 
     Args:
-        model: called with the constants; returns MJCF.
+        model: function from constants to MJCF.
     """
 
     def __init__(self, model: Callable[[Mapping[str, float]], str]) -> None:
@@ -65,18 +68,19 @@ class CompiledWorld:
         self._data: Any = None
 
     def __reduce__(self) -> tuple[type[CompiledWorld], tuple[Callable[[Mapping[str, float]], str]]]:
-        # A copy of a simulator, here or in another process, gets a world of its own.
+        # A copy of a simulator, in this or in another process, gets its own world.
         return CompiledWorld, (self._compile,)
 
     def fresh(self, constants: Mapping[str, float]) -> tuple[Any, Any]:
-        """Model and data as newly made, for these constants."""
+        """Return model and data in their initial state, for these constants."""
         if self._built_for != constants:
             mujoco = library()
             self._model = mujoco.MjModel.from_xml_string(self._compile(constants))
             disabled = mujoco.mjtDisableBit
-            # Joint damping explicit, as in Bullet and as `sims.engines.joint` takes it to be.
+            # Joint damping is explicit, as in Bullet and as `sims.engines.joint` assumes.
             self._model.opt.disableflags |= disabled.mjDSBL_EULERDAMP
-            # A lane that fails must be NaN: MuJoCo would reset it, and it would pass for done.
+            # A failed element must become NaN; otherwise MuJoCo would reset it, and it would look
+            # finished.
             self._model.opt.disableflags |= disabled.mjDSBL_AUTORESET
             self._data = mujoco.MjData(self._model)
             self._built_for = dict(constants)
@@ -85,12 +89,12 @@ class CompiledWorld:
         return self._model, self._data
 
     def close(self) -> None:
-        """Give back model and data."""
+        """Release model and data."""
         self._model = self._data = self._built_for = None
 
 
 class Joint:
-    """A body on one hinge or guide; see `sims.engines.joint.Joint`."""
+    """Body on one hinge or guide; see `sims.engines.joint.Joint`."""
 
     def __init__(self, world: CompiledWorld, module: MujocoJointModule) -> None:
         self._world = world
@@ -99,7 +103,7 @@ class Joint:
         self.open_loop: bool = module.OPEN_LOOP
 
     def start(self, constants: dict[str, float]) -> None:
-        """A world for these constants, as newly made."""
+        """Prepare a world for these constants, in its initial state."""
         self._constants, self.gravity = constants, self._gravity(constants)
         self._model, self._data = self._world.fresh(constants)
         self._x = self._data.qpos
@@ -108,28 +112,32 @@ class Joint:
         self._step = library().mj_step
 
     def pace(self, step: float, inertia: float, damping: float) -> bool:
-        """Step in seconds, generalised inertia, joint damping."""
+        """Set step (s), inertia and damping; return False if MuJoCo cannot represent them."""
         self._model.opt.timestep = step
         self._model.dof_damping[0] = damping
         return self._load(self._model, inertia, self._constants)
 
     def place(self, x: float, w: float) -> None:
-        """The joint's position and velocity."""
+        """Set the joint's position and velocity."""
         self._x[0] = x
         self._w[0] = w
 
     def advance(self, force: float) -> tuple[float, float]:
-        """One step."""
+        """Advance by one step; return position and velocity."""
         self._force[0] = force
         self._step(self._model, self._data)
         return self._x.item(), self._w.item()
 
     def glide(self, force: float, counts: Sequence[int]) -> list[tuple[float, float]]:
-        """Steps with a force or torque at the joint."""
+        """Advance by each number of steps in `counts` with a constant force or torque at the joint.
+
+        Returns:
+            Position and velocity after each count.
+        """
         states = []
         self._force[0] = force
         for count in counts:
-            # None where `joint` has taken the step itself, with an input of its own.
+            # The count is zero where `joint` has already made the step, with another input.
             if count:
                 self._step(self._model, self._data, count)
             states.append((self._x.item(), self._w.item()))
@@ -140,13 +148,13 @@ class Joint:
 
 
 class Mover:
-    """A ball on three slides; see `sims.engines.flight.Mover`."""
+    """Ball on three slide joints; see `sims.engines.flight.Mover`."""
 
     def __init__(self, world: CompiledWorld) -> None:
         self._world = world
 
     def start(self, constants: dict[str, float]) -> None:
-        """A world for these constants, as newly made, without contact."""
+        """Prepare a world for these constants in its initial state, with contact switched off."""
         mujoco = library()
         self._mass = constants["mass"]
         self._floor = constants["radius"]
@@ -162,28 +170,28 @@ class Mover:
         self._meets(False)
 
     def _meets(self, ground: bool) -> None:
-        """Let contact act or not."""
+        """Switch contact on or off."""
         flags = self._model.opt.disableflags
         self._model.opt.disableflags = (
             flags & ~self._no_contact if ground else flags | self._no_contact
         )
 
     def _contact(self, stiffness: float, damping: float) -> None:
-        """Stiffness (1/s^2) and damping (1/s) of the contact to come."""
+        """Set stiffness (1/s^2) and damping (1/s) of the following contacts."""
         self._model.geom_solref[:] = -stiffness, -damping
 
     def pace(self, step: float) -> None:
-        """Step in seconds."""
+        """Set the step in seconds."""
         self._model.opt.timestep = step
         self._hertz = 1.0 / step
 
     def place(self, x: Vector, w: Vector) -> None:
-        """Position and velocity."""
+        """Set position and velocity."""
         self._x[:] = x
         self._w[:] = w
 
     def advance(self, force: Vector) -> State:
-        """One step with a force at the centre."""
+        """Advance by one step with a force per unit mass at the centre."""
         mass = self._mass
         self._force[:] = mass * force[0], mass * force[1], mass * force[2]
         self._step(self._model, self._data)
@@ -191,7 +199,7 @@ class Mover:
         return self._x.tolist(), self._w.tolist()
 
     def glide(self, counts: Sequence[int]) -> list[State]:
-        """Steps under gravity."""
+        """Advance by each number of steps in `counts` under gravity alone; return the states."""
         states: list[State] = []
         for count in counts:
             self._step(self._model, self._data, count)
@@ -205,24 +213,27 @@ class Mover:
 
 
 class MujocoBall(Mover):
-    """A ball that MuJoCo's contact sends back in one step; see `sims.engines.flight.FlyingBall`."""
+    """Ball whose impact MuJoCo's contact solves in one step.
+
+    See `sims.engines.flight.FlyingBall`.
+    """
 
     def start(self, constants: dict[str, float]) -> None:
-        """As every ball's."""
+        """Prepare a world for these constants, with contact switched off."""
         super().start(constants)
         self._held = False
 
     @property
     def model(self) -> Any:
-        """The compiled world as `start` has made it."""
+        """The compiled model that `start` has prepared."""
         return self._model
 
     def be(self, held: bool, before: Any) -> None:
-        """Go on as another ball of this world, whose step and place follow.
+        """Load the contact state of another ball; its step and position must be set afterwards.
 
         Args:
-            held: whether contact holds it up.
-            before: its acceleration in the step before, from which MuJoCo's solver begins.
+            held: whether contact supports the ball.
+            before: acceleration of the previous step, with which MuJoCo's solver is warm-started.
         """
         self._held = held
         self._meets(held)
@@ -231,31 +242,37 @@ class MujocoBall(Mover):
 
     @property
     def became(self) -> tuple[bool, int, Any]:
-        """What makes another ball go on as this one: as for `be`, and what is disabled, before the
-        acceleration.
-        """
+        """State to continue as another ball: `held` of `be`, disable flags, `before` of `be`."""
         return self._held, self._model.opt.disableflags, self._data.qacc_warmstart
 
     def holding(self, step: float) -> tuple[float, float]:
-        """What contact that holds a ball up is to MuJoCo, as ``solref``."""
+        """Return the ``solref`` of contact that supports a resting ball, for this step."""
         hertz = 1.0 / step
         return -0.1 * hertz**2, -hertz  # (4)
 
     def pace(self, step: float) -> None:
-        """Step in seconds."""
+        """Set the step in seconds."""
         super().pace(step)
         if self._held:
             self._model.geom_solref[:] = self.holding(step)
 
     def strike(self, x: Vector, v: Vector, restitution: float, friction: float) -> Vector:
-        """MuJoCo's contact solver on one short step, gravity made up for, friction put in as an
-        impulse.
+        """Return the velocity after an impact, from MuJoCo's contact solver in one short step.
+
+        Gravity is compensated, and friction is applied as an impulse.
+
+        Args:
+            x: position at the impact.
+            v: velocity before the impact.
+            restitution: restitution coefficient.
+            friction: friction coefficient.
         """
         self._held = False
         self.pace(_IMPACT)
         self.place((x[0], x[1], self._floor - flight.INSIDE), v)
         self._contact(0.0, (1.0 + restitution) * self._hertz)  # (3)
-        # Of the tangential speed mu (1 + e) |vn| goes (`sims.engines.ground`), in this one step.
+        # The impact removes tangential speed mu (1 + e) |vn| (`sims.engines.ground`), in this one
+        # step.
         along = math.hypot(v[0], v[1])
         share = min(friction * (1.0 + restitution) * -v[2] / along, 1.0) if along else 0.0
         lost = share * self._hertz
@@ -265,9 +282,9 @@ class MujocoBall(Mover):
         return after
 
     def hold(self) -> None:
-        """Contact that damps and, very little, springs."""
+        """Set contact that supports the ball: damping, and a weak spring."""
         self._held = True
         self._meets(True)
-        # (4) depends on the step: where one is set already, contact is set for it.
+        # (4) depends on the step; if a step is already set, the contact is set for it.
         if not math.isnan(self._hertz):
             self.pace(1.0 / self._hertz)

@@ -1,4 +1,4 @@
-"""A ball on MuJoCo's contact as it comes: a spring and a damper."""
+"""Ball on MuJoCo's native soft contact: a spring and a damper."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from sims.engines.mujoco_bodies import CompiledWorld, Mover
 from sims.engines.point import State, Vector
 
 _MOST_DAMPED = 2.0
-"""Largest damping ratio of a springy contact."""
+"""Largest damping ratio of a soft contact."""
 
 
 class SoftBall(Mover):
-    """A ball on MuJoCo's springy contact; see `sims.engines.native.NativeBall`.
+    """Ball on MuJoCo's soft contact; see `sims.engines.native.NativeBall`.
 
-    Friction is put in as a force, a share of the normal force of the step before.
+    Friction is applied as a force: a fraction of the normal force of the previous step.
     """
 
     damping = 0.0
@@ -24,44 +24,45 @@ class SoftBall(Mover):
         self._stiffness = stiffness
 
     def start(self, constants: dict[str, float]) -> None:
-        """As every ball's, with contact."""
+        """Prepare a world for these constants, with contact switched on."""
         super().start(constants)
         self._meets(True)
         self._touched = math.nan, math.nan
 
     def touch(self, restitution: float, friction: float) -> None:
-        """Damping that gives this restitution if the step is short; friction."""
+        """Set friction, and the damping that gives this restitution for short steps."""
         if (restitution, friction) != self._touched:
             self._touched = restitution, friction
-            # Of a spring of k and a damper of b per unit mass, the damping ratio is b / (2 sqrt k).
+            # For stiffness k and damping b per unit mass, the damping ratio is b / (2 sqrt k).
             damping = 2.0 * damping_ratio(restitution) * math.sqrt(self._stiffness)
             self._contact(self._stiffness, damping)
 
     def near(self, gap: float) -> bool:
-        """Touching."""
+        """Return whether the ball touches the ground."""
         return gap <= 0.0
 
     def advance(self, force: Vector) -> State:
-        """One step with a force at the centre and what friction there is."""
+        """Advance by one step with a force per unit mass at the centre, and contact friction."""
         friction = self._touched[1]
         if friction and self._data.nefc:
             vx, vy, _ = self._w.tolist()
             slip = math.hypot(vx, vy)
             normal = float(self._data.efc_force[0])
-            # No more than stops the slip within the step.
+            # Friction must not do more than stop the slip within the step.
             share = min(friction * normal / self._mass / slip, self._hertz) if slip else 0.0
             force = force[0] - share * vx, force[1] - share * vy, force[2]
         return super().advance(force)
 
 
 def damping_ratio(restitution: float) -> float:
-    """The damping ratio of a spring and damper that push but do not pull, for a restitution; at
-    most 2, for 0.06.
+    """Return the damping ratio of a spring and damper that only push, for a given restitution.
+
+    It is at most 2, which gives a restitution of 0.06.
 
     T. Schwager, T. Poeschel, Granular Matter 9, 465 (2007), doi:10.1007/s10035-007-0065-z, equation
     20.
     """
-    # Restitution falls with damping; sixty halvings leave nothing but rounding.
+    # Restitution decreases with damping. After 60 bisections, only rounding error remains.
     low = 0.0
     high = _MOST_DAMPED
     for _ in range(60):
@@ -71,7 +72,7 @@ def damping_ratio(restitution: float) -> float:
 
 
 def _rebound(ratio: float) -> float:
-    """Restitution of a spring and damper of this damping ratio."""
+    """Return the restitution of a spring and damper with this damping ratio."""
     if ratio >= 1.0:
         root = math.sqrt(ratio * ratio - 1.0)
         return math.exp(-2.0 * ratio * math.acosh(ratio) / root) if root else math.exp(-2.0)

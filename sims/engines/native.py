@@ -1,14 +1,15 @@
-"""A ball stepped by an engine as it comes: its own integrator and contact, first order in the step,
-nothing corrected.
+"""Integrate a ball with an engine's native integrator and contact model, without corrections.
 
-Effects act by their force at the beginning of each step. What they make of an impact is set once
-the next step may bring the ball to the ground. In flight the smooth acceleration, which no engine
+The result is of first order in the step.
+
+Effects act through their force at the beginning of each step. Their contact parameters are set when
+the next step may bring the ball to the ground. The smooth acceleration in flight, which no engine
 reports, is
 
-    a = g + pull - k v (1 + |v|)                                           (1)
+    a = g + f - k v (1 + |v|)                                              (1)
 
-with k what the engine takes for air (`sims.ball.bullet_world`), and there is no vertical one where
-the ball rests.
+with f the effects' force per unit mass and k the engine's air damping (`sims.ball.bullet_world`).
+There is no vertical acceleration where the ball rests.
 """
 
 from __future__ import annotations
@@ -24,27 +25,35 @@ from sims.engines.flight import Mover
 from sims.engines.point import Impact, Pull, Vector, gravity, path_of
 
 _SLOW = 0.2
-"""m/s below which Bullet takes a ball on the ground for resting."""
+"""Speed in m/s below which Bullet treats a ball on the ground as resting."""
 
 
 class NativeBall(Mover, Protocol):
-    """A ball over level ground in an engine."""
+    """Ball over level ground in an engine."""
 
     damping: float
-    """What the engine takes for air: -damping v (1 + |v|), m/s^2."""
+    """Coefficient of the engine's air damping: -damping v (1 + |v|), in m/s^2."""
 
     def touch(self, restitution: float, friction: float) -> None:
-        """Set restitution and friction of the impacts to come."""
+        """Set restitution and friction coefficient of the following impacts."""
         ...
 
     def near(self, gap: float) -> bool:
-        """Whether contact may act where the ball's lower side is `gap` above the ground."""
+        """Return whether contact may act with the ball's lowest point `gap` m above the ground."""
         ...
 
 
 def rollout(ball: NativeBall, lane: Lane) -> Path:
-    """Integrate one lane."""
-    # Unlike in `flight`, the engine's velocity is read as it comes, and so is its contact.
+    """Integrate one batch element.
+
+    Args:
+        ball: ball in an engine.
+        lane: batch element to integrate.
+
+    Returns:
+        Positions, velocities and accelerations (N, 3); NaN if the integration failed.
+    """
+    # Unlike in `flight`, velocity and contact of the engine are used without correction.
     contact = Impact(lane)
     felt = Pull(lane)
     floor = float(lane.system.floor(lane.constants)[0, 0])
@@ -66,14 +75,14 @@ def rollout(ball: NativeBall, lane: Lane) -> Path:
             states = []
             for count in counts:
                 for _ in range(count):
-                    # Where the next step may end: contact acts in it or not at all.
+                    # Contact can act only if the predicted end of the next step is near the ground.
                     if contact.changes and w[2] < 0.0 and ball.near(x[2] + step * w[2] - floor):
                         ball.touch(*contact.at(-w[2]))
                     x, w = ball.advance(felt.at(t, x, w))
                     t += step
                 states.append((*x, *w, *felt.at(t, x, w)))
         else:
-            # Nothing to ask for: the engine runs from sample to sample.
+            # No force must be evaluated: the engine runs from sample to sample.
             states = [(*x, *w, 0.0, 0.0, 0.0) for x, w in ball.glide(counts)]
         rows.extend(states if begin + sum(counts) in kept else states[:-1])
         if not math.isfinite(sum(rows[-1])):

@@ -1,4 +1,4 @@
-"""What acts on a ball beside its engine: effects, and the numbers of an impact."""
+"""Effect forces and impact parameters of a ball that an external engine integrates."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from sims.engines.ground import PATIENCE, SHORT, SHORTEST
 from sims.engines.scalar import resistance, resistances
 
 Vector = Sequence[float]
-"""x, y, z."""
+"""Vector x, y, z."""
 State = tuple[Vector, Vector]
 """Position and the engine's velocity."""
 
 
 def gravity(lane: Lane) -> Vector:
-    """The acceleration of gravity, the same everywhere."""
+    """Return the acceleration of gravity, which is constant."""
     start = np.zeros((1, 1))
     nothing = np.zeros((1, 3))
     moment = lane.moment(start, nothing, nothing, {})
@@ -29,7 +29,15 @@ def gravity(lane: Lane) -> Vector:
 
 
 def path_of(lane: Lane, rows: list[tuple[float, ...]]) -> Path:
-    """Rows of position, velocity, acceleration; NaN if some are missing."""
+    """Split rows of position, velocity and acceleration; all NaN if rows are missing.
+
+    Args:
+        lane: integrated batch element.
+        rows: nine numbers for each recorded state.
+
+    Returns:
+        Positions, velocities and accelerations (N, 3).
+    """
     if len(rows) < lane.kept.size:
         rows = [(math.nan,) * 9] * lane.kept.size
     table = np.array(rows)
@@ -37,7 +45,7 @@ def path_of(lane: Lane, rows: list[tuple[float, ...]]) -> Path:
 
 
 class Pull:
-    """What effects add to gravity."""
+    """Force per unit mass of the effects, in addition to gravity."""
 
     def __init__(self, lane: Lane) -> None:
         self._ask = Forces([lane], 1)
@@ -45,12 +53,18 @@ class Pull:
         self.any = self._ask.any
 
     def at(self, t: float, x: Vector, v: Vector) -> Vector:
-        """m/s^2, dry friction (which no effect of the library gives to a free ball) against the
-        velocity.
+        """Return the force per unit mass in m/s^2 at a state.
+
+        Dry friction, which no effect of the library applies to a free ball, opposes the velocity.
+
+        Args:
+            t: time in seconds.
+            x: position.
+            v: velocity.
         """
         vx, vy, vz = v
         speed = math.sqrt(vx * vx + vy * vy + vz * vz)
-        # What opposes the motion is counted as a share of the velocity: force = -share v.
+        # Resistance is counted per unit of velocity: force = -share v.
         if self._opposing:
             share = self._opposing.at(speed)[0]
             limit = self._opposing.limit
@@ -63,22 +77,24 @@ class Pull:
             fx, fy, fz = self._ask.force()[0].tolist()
             share = 0.0
             limit = self._ask.limit()
-        # Dry friction has no direction where there is no motion.
+        # Dry friction has no direction at rest.
         if limit and speed:
             share += limit / speed
         return fx - share * vx, fy - share * vy, fz - share * vz
 
 
 class Pulls:
-    """`Pull` of many lanes: for each of which effects are asked, or for each of which they are
-    written out.
+    """Force per unit mass of the effects on many batch elements; see `Pull`.
+
+    If all effects of all elements have closed forms, these are used; otherwise effects are
+    evaluated.
     """
 
     def __init__(self, lanes: Sequence[Lane]) -> None:
         self._take(lanes)
 
     def only(self, count: int) -> None:
-        """Go on with the first lanes."""
+        """Continue with the first `count` elements only."""
         if count < len(self._lanes):
             self._take(self._lanes[:count])
 
@@ -89,7 +105,13 @@ class Pulls:
         self._ask = None if known else Forces(lanes, 1)
 
     def at(self, t: Array, x: Array, v: Array) -> Array:
-        """(n, 3) m/s^2, at instants t (n,), positions and velocities (n, 3)."""
+        """Return the forces per unit mass (n, 3) in m/s^2.
+
+        Args:
+            t: (n,) times in seconds.
+            x: (n, 3) positions.
+            v: (n, 3) velocities.
+        """
         vx, vy, vz = v.T
         speed = np.sqrt(vx * vx + vy * vy + vz * vz)
         limit: Array | None
@@ -106,7 +128,7 @@ class Pulls:
             force = self._ask.force()
             share = np.zeros(t.size)
             limit = self._ask.limits() if self._ask.rubs else None
-        # Dry friction has no direction where there is no motion.
+        # Dry friction has no direction at rest.
         if limit is not None:
             rubs = (limit != 0.0) & (speed != 0.0)
             share = share + np.where(rubs, limit / np.where(rubs, speed, 1.0), 0.0)
@@ -115,7 +137,7 @@ class Pulls:
 
 
 class Impact:
-    """The numbers of an impact, from the system and the effects on contact."""
+    """Parameters of impacts, from the system and the contact effects."""
 
     def __init__(self, lane: Lane) -> None:
         self._restitution = lane.system.restitution(lane.theta)
@@ -124,11 +146,11 @@ class Impact:
 
     @property
     def changes(self) -> bool:
-        """Whether any effect acts."""
+        """Whether any contact effect is active."""
         return bool(self._effects)
 
     def at(self, speed: float) -> tuple[float, float]:
-        """Restitution and friction of an impact at this speed."""
+        """Return restitution and friction coefficient of an impact at this speed (m/s)."""
         restitution = self._restitution
         friction = 0.0
         for effect, c in self._effects:
@@ -137,20 +159,26 @@ class Impact:
         return float(restitution[0, 0]), friction
 
     def law(self, speed: float, down: float) -> tuple[float, float, bool]:
-        """Restitution, friction, and whether bouncing is over, for a ball that falls with
-        acceleration `down`.
+        """Return the parameters of an impact, and whether bouncing ends with it.
 
-        The friction of the last impact includes that of all the bounces that are left out.
+        The friction of the last impact includes the friction of all omitted bounces.
+
+        Args:
+            speed: normal speed before the impact in m/s.
+            down: downward acceleration in m/s^2.
+
+        Returns:
+            Restitution, friction coefficient, and whether bouncing is finished.
         """
-        # Equation numbers are those of `sims.engines.ground`.
+        # Equation numbers refer to `sims.engines.ground`.
         restitution, friction = self.at(speed)
         up = restitution * speed  # (1)
         flight = 2.0 * up / down if down > 0.0 else math.inf  # (3)
         self._shorts = self._shorts + 1 if flight < SHORT else 0
         if flight >= SHORTEST and self._shorts <= PATIENCE:
             return restitution, friction, False
-        # Engines take mu (1 + e) |vn| with the e that is returned, which is 0: all of (4) and the
-        # factor 1 + e of this impact go into the friction.
-        later = up / (1.0 - restitution) if restitution < 1.0 else 0.0  # (4), over mu (1 + e)
+        # Engines remove mu (1 + e) |vn| with the returned e, which is 0. Therefore all of (4) and
+        # the factor 1 + e of this impact are included in the friction.
+        later = up / (1.0 - restitution) if restitution < 1.0 else 0.0  # (4), divided by mu (1 + e)
         total = friction * (1.0 + restitution) * (1.0 + later / speed) if speed else 0.0
         return 0.0, total, True

@@ -1,8 +1,8 @@
-"""The commonest effects in plain numbers, for engines that go lane by lane and step by step.
+"""Closed-form laws of the most common effects, for engines that step one element at a time.
 
-Asking an effect for its force takes NumPy some microseconds, as long as the engine's own step. For
-the laws below, and only as the library has them, it is worth writing them once more; tests compare
-both.
+Evaluating an effect's force with NumPy takes some microseconds, as long as the engine's own step.
+Therefore the laws below are implemented a second time in plain numbers; they are used only for the
+effects of the library itself. Tests compare both implementations.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from sims.engines.external import Lane
 from sims.system import Contact, Effect
 
 Law = Callable[[Any, Any], tuple[Any, Any]]
-"""Coefficient and speed (numbers, or arrays alike) -> resistance r in force = -r v, and by how much
-r times speed grows with speed.
+"""Law of a resistance as a function of coefficient and speed (numbers or equal-shaped arrays).
+
+It returns the resistance r in force = -r v, and the derivative of r times speed with respect to
+speed.
 """
 
 _LAWS: Mapping[str, Law] = {
@@ -30,18 +32,18 @@ _LAWS: Mapping[str, Law] = {
 
 @dataclass(frozen=True)
 class Resistance:
-    """What opposes the motion and depends on nothing but speed.
+    """Forces that oppose the motion and depend on the speed alone.
 
     Attributes:
-        laws: those that act, with their coefficients.
-        limit: of dry friction.
+        laws: active laws with their coefficients.
+        limit: limit of dry friction.
     """
 
     laws: tuple[tuple[Law, float], ...]
     limit: float
 
     def at(self, speed: float) -> tuple[float, float]:
-        """The sum of all laws at this speed; see `Law`."""
+        """Return the sums of resistance and slope over all laws at this speed; see `Law`."""
         resistance = slope = 0.0
         for law, c in self.laws:
             more, steeper = law(c, speed)
@@ -52,18 +54,18 @@ class Resistance:
 
 @dataclass(frozen=True)
 class Resistances:
-    """`Resistance` of many lanes.
+    """`Resistance` of many batch elements.
 
     Attributes:
-        laws: those that act on any lane, with their coefficients (n,).
-        limit: (n,) of dry friction; None where no lane has any.
+        laws: laws active on at least one element, with coefficients (n,).
+        limit: (n,) limits of dry friction; None where no element has any.
     """
 
     laws: tuple[tuple[Law, Array], ...]
     limit: Array | None
 
     def at(self, speed: Array) -> tuple[Array, Array]:
-        """The sums of all laws at these speeds (n,); see `Law`."""
+        """Return the sums (n,) of resistance and slope over all laws at speeds (n,); see `Law`."""
         if not self.laws:
             return np.zeros(speed.size), np.zeros(speed.size)
         (law, c), *others = self.laws
@@ -75,13 +77,13 @@ class Resistances:
         return resistance, slope
 
     def first(self, count: int) -> Resistances:
-        """Of the first lanes."""
+        """Return the laws of the first `count` elements."""
         laws = tuple((law, c[:count]) for law, c in self.laws)
         return Resistances(laws, None if self.limit is None else self.limit[:count])
 
 
 def resistances(lanes: Sequence[Lane]) -> Resistances:
-    """All effects of lanes for each of which `resistance` is not None."""
+    """Return the closed-form laws of batch elements, for none of which `resistance` is None."""
     found = [resistance(lane) for lane in lanes]
     limits = np.array([one.limit if one else 0.0 for one in found])
     laws = []
@@ -95,23 +97,27 @@ def resistances(lanes: Sequence[Lane]) -> Resistances:
 
 
 def resistance(lane: Lane) -> Resistance | None:
-    """All effects of the lane but those on contact; None if some are not of this kind."""
+    """Return the closed-form laws of all effects of an element, except contact effects.
+
+    Returns:
+        The laws; None if an effect has no closed-form law here.
+    """
     laws: list[tuple[Law, float]] = []
     limit = 0.0
     for effect, c in lane.effects:
         number = float(c[0, 0, 0])
         if isinstance(effect, Contact):
-            continue  # it acts at impacts alone, where it is asked by itself
+            continue  # it acts only at impacts, where it is evaluated separately
         if is_library(effect, "friction.coulomb"):
             limit += max(number, 0.0)  # as in the effect: friction is never negative
         elif effect.name in _LAWS and is_library(effect, effect.name):
             laws.append((_LAWS[effect.name], number))
         else:
-            return None  # where one must be asked, all are asked together
+            return None  # one effect without a closed form: all are evaluated as effects
     return Resistance(tuple(laws), limit)
 
 
 def is_library(effect: Effect, name: str) -> bool:
-    """Whether this is the library's own effect of this name."""
-    # A plugin may take over a name with a law of its own, which must be asked for.
+    """Return whether an effect is the library's own effect of this name."""
+    # A plugin may replace an effect of this name with another law, which must be evaluated.
     return effect.name == name and type(effect).__module__.startswith("sims.effects.")

@@ -1,4 +1,4 @@
-"""When lanes that are integrated together step, and which of their states are kept."""
+"""Step schedule of batch elements that are integrated together."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from sims.engines.external import Lane
 
 
 class Table:
-    """The steps of lanes, the longest lane first.
+    """Step schedule of batch elements; the longest element is the first.
 
     Attributes:
-        steps: (L, S) seconds; behind the end of a shorter lane stands its last step.
-        paced: (S + 1,) whether any lane's step is another than the one before; True at the first.
-        rows: (S + 1,) under which number the state after so many steps is kept; -1 where none is.
-        kept: how many states are kept.
+        sizes: (L,) number of steps of each element.
+        steps: (L, S) step sizes in seconds; shorter elements are padded with their last step.
+        paced: (S + 1,) whether the step size of any element changes here; True at the first step.
+        rows: (S + 1,) index of the record of the state after this number of steps; -1 for none.
+        kept: number of recorded states.
     """
 
     def __init__(self, lanes: Sequence[Lane]) -> None:
@@ -28,14 +29,14 @@ class Table:
         self.paced[0] = True
         self.paced[1:size] = (np.diff(self.steps, axis=1) != 0.0).any(axis=0)
         keeps = np.zeros(size + 1, dtype=bool)
-        # Lanes of one run share the array.
+        # Elements of one run share the array.
         for kept in {id(lane.kept): lane.kept for lane in lanes}.values():
             keeps[kept] = True
         self.rows = np.where(keeps, np.cumsum(keeps) - 1, -1)
         self.kept = int(keeps.sum())
 
     def phases(self) -> Iterator[tuple[int, int, int]]:
-        """First step and the one after the last, and how many lanes are under way in between."""
+        """Yield first step, end step (exclusive) and number of active elements of each phase."""
         begin = 0
         for end in np.unique(self.sizes).tolist():
             yield begin, end, int((self.sizes >= end).sum())
@@ -43,6 +44,6 @@ class Table:
 
 
 def filled(rows: Sequence[Array]) -> Array:
-    """Rows of several sizes as (L, S), the last value of a shorter one over and over."""
+    """Stack rows of different sizes as (L, S); repeat the last value of shorter ones."""
     size = max(row.size for row in rows)
     return np.stack([np.concatenate([row, np.full(size - row.size, row[-1])]) for row in rows])

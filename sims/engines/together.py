@@ -1,6 +1,6 @@
-"""Which lanes an engine integrates together, and which by themselves.
+"""Choose which batch elements an engine integrates together, and which one by one.
 
-Both come to the same, bit for bit; together costs less where there are lanes enough.
+Both give the same results, bit for bit. Integration together is faster for enough elements.
 """
 
 from __future__ import annotations
@@ -13,39 +13,42 @@ from typing import Protocol
 from sims.engines.external import ApartError, Lane, Path, in_turn
 
 _STEPS = 2_000_000
-"""Steps of all lanes together: what is held for them takes some dozens of bytes each."""
+"""Maximum number of steps of all elements of a batch; each needs a few dozen bytes of memory."""
 
 
 class Company(Protocol):
-    """Integrates lanes together."""
+    """Integrator of several batch elements together."""
 
     @property
     def fewest(self) -> Mapping[str, int]:
-        """Lanes of a kind from which on together is quicker; it never is where none is said."""
+        """Minimum number of elements, by kind, for which integration together is faster.
+
+        A kind that is missing is never faster together.
+        """
         ...
 
     @property
     def most(self) -> int:
-        """Lanes of which together no more are quicker."""
+        """Maximum number of elements for which integration together is faster."""
         ...
 
     @property
     def alike(self) -> bool:
-        """Whether lanes can be together only if they make the same steps."""
+        """Whether elements can be integrated together only if their steps are equal."""
         ...
 
     def kind(self, lane: Lane) -> str:
-        """Lanes of one kind can be together."""
+        """Return the kind of an element; elements of one kind can be integrated together."""
         ...
 
     def rollouts(self, lanes: Sequence[Lane]) -> list[Path | None]:
-        """Integrate lanes of the same constants and kind, each of at least one step.
+        """Integrate elements of equal constants and kind, each with at least one step.
 
         Returns:
-            The motion of each; None where it must be integrated by itself.
+            The trajectory of each; None where it must be integrated by itself.
 
         Raises:
-            ApartError: all of them must.
+            ApartError: all of them must be integrated one by one.
         """
         ...
 
@@ -56,13 +59,13 @@ def rollouts(
     discard: Callable[[], None],
     lanes: Sequence[Lane],
 ) -> Iterator[Path]:
-    """Each lane's motion, in their order.
+    """Integrate all batch elements and yield their trajectories in order.
 
     Args:
-        alone: integrates one.
-        company: integrates several.
-        discard: called behind a lane that failed by itself.
-        lanes: the work.
+        alone: integrates one element.
+        company: integrates several elements together.
+        discard: called after an element that failed when integrated by itself.
+        lanes: batch elements to integrate.
     """
     paths: dict[int, Path] = {}
     for group in _groups(lanes, company):
@@ -78,7 +81,7 @@ def rollouts(
 
 
 def _groups(lanes: Sequence[Lane], company: Company) -> list[list[int]]:
-    """Numbers of lanes that are to be integrated together."""
+    """Return groups of indices of the elements that are integrated together."""
     groups: dict[tuple[object, str], list[int]] = {}
     for i, lane in enumerate(lanes):
         if lane.steps.size:
@@ -90,6 +93,6 @@ def _groups(lanes: Sequence[Lane], company: Company) -> list[list[int]]:
         if len(group) >= company.fewest.get(kind, math.inf):
             longest = max(lanes[i].steps.size for i in group)
             count = -(-len(group) // max(min(company.most, _STEPS // longest), 1))
-            # As many in each part, or one less.
+            # The parts differ in size by at most one element.
             parts += [group[k::count] for k in range(count)]
     return parts

@@ -1,9 +1,10 @@
-"""What the engines ask of the world modules that stand beside a system's own module.
+"""Interface of the world modules that build a system in PyBullet or MuJoCo.
 
-A system that Bullet carries has a module ``bullet_world`` beside it, one that MuJoCo carries a
-module ``mujoco_world``. What such a module must have depends on what the system is: a body on one
-hinge or guide is loaded with an inertia, a ball that bounces is not. The protocols below state it;
-a module that does not fulfil its protocol is refused by name before anything is simulated.
+A system that PyBullet can simulate has a module ``bullet_world`` in its package, one that MuJoCo
+can simulate a module ``mujoco_world``. The required members depend on the system: a body on a hinge
+or guide needs a function that sets its inertia, a bouncing ball does not. The protocols below
+specify them. A module that does not fulfil its protocol is rejected with the name of the missing
+member before any simulation.
 """
 
 from __future__ import annotations
@@ -18,77 +19,104 @@ from typing import Any, Generic, Protocol
 from sims.system import System
 
 Constants = Mapping[str, float]
-"""A system's known numbers by name, SI units."""
+"""Known constants of a system by name, in SI units."""
 
 
 class JointModule(Protocol):
-    """What either engine asks of a system of one coordinate: a body on one hinge or guide."""
+    """World module of a one-coordinate system: a body on one hinge or guide."""
 
     OPEN_LOOP: bool
-    """Whether the drive depends on the inputs alone, so that the engine may run on its own while
-    they are constant."""
+    """Whether the drive depends on the inputs alone.
+
+    If True, the engine runs on its own while the inputs are constant.
+    """
 
     def gravity(self, constants: Constants, /) -> Callable[[float], float]:
-        """The generalised force (N or N*m) that the engine's own gravity exerts at a position (m or
-        rad).
+        """Return a function from position to the generalised force of the engine's own gravity.
+
+        Positions are in m or rad, forces in N or N*m.
         """
         ...
 
 
 class BulletModule(Protocol):
-    """A ``bullet_world``."""
+    """Module ``bullet_world`` of a system."""
 
     def build(self, client: int, constants: Constants, /) -> int:
-        """Build the world in the empty client; returns the moving body's id."""
+        """Build the world in an empty client; return the id of the moving body."""
         ...
 
 
 class BulletJointModule(BulletModule, JointModule, Protocol):
-    """A ``bullet_world`` of one coordinate."""
+    """Module ``bullet_world`` of a one-coordinate system."""
 
     def load(self, client: int, body: int, inertia: float, constants: Constants, /) -> bool:
-        """Give the body this generalised inertia (kg or kg*m^2); False if Bullet cannot represent
-        it.
+        """Set the generalised inertia of the body.
+
+        Args:
+            client: Bullet client of the world.
+            body: id of the body.
+            inertia: generalised inertia in kg or kg*m^2.
+            constants: constants of the system by name.
+
+        Returns:
+            False if Bullet cannot represent the inertia.
         """
         ...
 
 
 class BulletBallModule(BulletModule, Protocol):
-    """A ``bullet_world`` of a ball that bounces, which `native_contact` needs."""
+    """Module ``bullet_world`` of a bouncing ball, required for the setting `native_contact`."""
 
     def build_native(self, client: int, constants: Constants, /, settings: Constants) -> int:
-        """Build Bullet's own world, with the engine's settings; returns the ball's id."""
+        """Build the world with Bullet's native contact.
+
+        Args:
+            client: Bullet client of the world.
+            constants: constants of the system by name.
+            settings: settings of the engine by name.
+
+        Returns:
+            The id of the ball.
+        """
         ...
 
 
 class MujocoModule(Protocol):
-    """A ``mujoco_world``."""
+    """Module ``mujoco_world`` of a system."""
 
     def model(self, constants: Constants, /) -> str:
-        """The world as MJCF."""
+        """Return the world as MJCF."""
         ...
 
 
 class MujocoJointModule(MujocoModule, JointModule, Protocol):
-    """A ``mujoco_world`` of one coordinate."""
+    """Module ``mujoco_world`` of a one-coordinate system."""
 
     def load(self, model: Any, inertia: float, constants: Constants, /) -> bool:
-        """Give the compiled model (an ``MjModel``) this generalised inertia (kg or kg*m^2); False
-        if MuJoCo cannot represent it.
+        """Set the generalised inertia in a compiled model.
+
+        Args:
+            model: compiled model (``MjModel``).
+            inertia: generalised inertia in kg or kg*m^2.
+            constants: constants of the system by name.
+
+        Returns:
+            False if MuJoCo cannot represent the inertia.
         """
         ...
 
 
 def world_module(system: type[System], name: str, asked: type) -> tuple[ModuleType | None, str]:
-    """The world module of a system, if the engine can use it.
+    """Find the world module of a system and check its interface.
 
     Args:
-        system: whose world it is.
-        name: of the module beside the one that declares the system.
-        asked: the protocol that the module must fulfil.
+        system: system whose world is needed.
+        name: name of the module in the package of the system's own module.
+        asked: protocol that the module must fulfil.
 
     Returns:
-        The module and an empty text, or None and why there is none.
+        The module and an empty text, or None and the reason why there is no usable module.
     """
     package = system.__module__.rpartition(".")[0]
     if not package or find_spec(f"{package}.{name}") is None:
@@ -100,12 +128,20 @@ def world_module(system: type[System], name: str, asked: type) -> tuple[ModuleTy
 
 
 def lacking(module: ModuleType, asked: type) -> str:
-    """What a module lacks to fulfil the protocol `asked`, as the end of a sentence; empty if
-    nothing.
+    """Describe which member of the protocol `asked` a module does not have.
 
-    A type checker sees the modules of this project; this sees everybody's, when they are loaded.
+    A type checker covers the modules of this project; this function covers external modules as
+    well, when they are loaded.
+
+    Args:
+        module: world module to check.
+        asked: protocol that the module must fulfil.
+
+    Returns:
+        The end of a sentence; empty if the module is complete.
     """
-    # From the most general protocol to the module's own: what all worlds need is named first.
+    # The check begins with the most general protocol, so that members required of all worlds are
+    # reported first.
     for part in reversed(asked.__mro__):
         if part in (object, Generic, Protocol):
             continue
@@ -119,7 +155,7 @@ def lacking(module: ModuleType, asked: type) -> str:
 
 
 def _answers(found: Any, asked: Callable[..., Any]) -> bool:
-    """Whether `found` can be called as the engine calls the protocol's function."""
+    """Return whether `found` can be called with the arguments of the protocol's function."""
     if not callable(found):
         return False
     parameters = list(inspect.signature(asked).parameters.values())[1:]  # the first is self

@@ -1,17 +1,17 @@
-"""The pendulum's world in Bullet.
+"""World of the pendulum in Bullet.
 
-Only mass x length and the inertia about the hinge matter to the motion. Bullet wants the inertia
+Only mass x length and the inertia about the hinge affect the motion. Bullet requires the inertia
 about the centre of mass,
 
     inertia - mass length^2                                                (1)
 
-which would be negative for light inertias; a body k times heavier on an arm k times shorter has the
-same gravity torque and next to no inertia from its arm:
+which would be negative for small inertias. A body k times heavier on an arm k times shorter has the
+same torque of gravity, and almost no inertia from its arm:
 
     k mass (length / k)^2 = mass length^2 / k                              (2)
 
-So the inertia may be anything above mass length^2 / 1000, also what no rigid body with this centre
-of mass could have (below mass length^2).
+So the inertia may be anything above mass length^2 / 1000, also values that no rigid body with this
+centre of mass could have (below mass length^2).
 """
 
 from __future__ import annotations
@@ -22,13 +22,18 @@ from collections.abc import Callable, Mapping
 from sims import bullet
 
 OPEN_LOOP = True
-"""The torque is the input, whatever the motion."""
+"""Whether the torque depends on the input alone."""
 SHORTER = 1000.0
-"""k of eq. (2)."""
+"""Factor k of equation (2), by which the body is heavier and its arm is shorter."""
 
 
 def build(client: int, constants: Mapping[str, float]) -> int:
-    """A fixed hinge along y with one link hanging from it; returns the body's id."""
+    """Build a fixed hinge along y with one hanging link; return the body's id.
+
+    Args:
+        client: Bullet client of an empty world.
+        constants: constants of the system by name.
+    """
     p = bullet.engine()
     p.setGravity(0.0, 0.0, -constants["gravity"], physicsClientId=client)
     hanging = (0.0, 0.0, -constants["length"] / SHORTER)
@@ -38,9 +43,16 @@ def build(client: int, constants: Mapping[str, float]) -> int:
 
 
 def load(client: int, body: int, inertia: float, constants: Mapping[str, float]) -> bool:
-    """Give the link this inertia about the hinge; False if Bullet cannot represent it."""
+    """Set the link's inertia about the hinge; return False if Bullet cannot represent it.
+
+    Args:
+        client: Bullet client of the world.
+        body: id of the body.
+        inertia: generalised inertia in kg or kg*m^2.
+        constants: constants of the system by name.
+    """
     at_centre = inertia - constants["mass"] * constants["length"] ** 2 / SHORTER  # (1), (2)
-    if not at_centre > 0.0:  # also what is not a number
+    if not at_centre > 0.0:  # also for NaN
         return False
     diagonal = (at_centre, at_centre, at_centre)
     bullet.engine().changeDynamics(body, 0, localInertiaDiagonal=diagonal, physicsClientId=client)
@@ -48,6 +60,6 @@ def load(client: int, body: int, inertia: float, constants: Mapping[str, float])
 
 
 def gravity(constants: Mapping[str, float]) -> Callable[[float], float]:
-    """Bullet's torque on the joint, N*m, at an angle."""
+    """Return a function from angle to Bullet's gravity torque on the joint in N*m."""
     weight = constants["mass"] * constants["length"] * constants["gravity"]
     return lambda q: -weight * math.sin(q)

@@ -1,7 +1,7 @@
-"""The pendulum's world in MuJoCo: gravity's torque from a body on a short arm, the inertia from the
-joint's armature.
+"""World of the pendulum in MuJoCo.
 
-As in Bullet (`sims.pendulum.bullet_world`) the inertia may be anything above mass length^2 / 1000.
+A body on a short arm gives the torque of gravity, and the armature of the joint the inertia. As in
+Bullet (`sims.pendulum.bullet_world`) the inertia may be anything above mass length^2 / 1000.
 """
 
 from __future__ import annotations
@@ -9,20 +9,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sims.pendulum.bullet_world import gravity  # the same torque
+from sims.pendulum.bullet_world import gravity  # same torque as in Bullet
 
 __all__ = ["OPEN_LOOP", "gravity", "load", "model"]
 
 OPEN_LOOP = True
-"""The torque is the input, whatever the motion."""
+"""Whether the torque depends on the input alone."""
 SHORTER = 1000.0
-"""The body is so many times heavier, its arm so many times shorter."""
+"""Factor by which the body is heavier and its arm is shorter than in the system."""
 _TINY = 1e-14
-"""kg m^2: MuJoCo wants the body to have some inertia of its own."""
+"""Inertia of the body in kg m^2: MuJoCo requires a positive value."""
 
 
 def model(constants: Mapping[str, float]) -> str:
-    """The world as MJCF."""
+    """Return the world as MJCF."""
     mass = constants["mass"] * SHORTER
     arm = constants["length"] / SHORTER
     return f"""
@@ -38,7 +38,13 @@ def model(constants: Mapping[str, float]) -> str:
 
 
 def load(model: Any, inertia: float, constants: Mapping[str, float]) -> bool:
-    """Give the joint the armature that makes up this inertia; False if there is none."""
+    """Set the joint's armature for this inertia; return False if it would not be positive.
+
+    Args:
+        model: compiled model (``MjModel``).
+        inertia: generalised inertia in kg or kg*m^2.
+        constants: constants of the system by name.
+    """
     armature = inertia - constants["mass"] * constants["length"] ** 2 / SHORTER - _TINY
     model.dof_armature[0] = armature
     return armature > 0.0

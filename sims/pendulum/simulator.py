@@ -1,11 +1,11 @@
-"""The pendulum as a registered simulator."""
+"""Registered simulator of the pendulum."""
 
 from sims.pendulum.system import PendulumSystem
 from sims.simulated import Simulated
 
 
 class Pendulum(Simulated):
-    """A pendulum; see `PendulumSystem`."""
+    """Pendulum; see `PendulumSystem`."""
 
     system = PendulumSystem
     default_engine = "pybullet"

@@ -1,4 +1,4 @@
-"""The pendulum: a rigid body on a hinge, declared once for every engine."""
+"""Pendulum: a rigid body on a hinge, declared once for every engine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sims.system import Kind, Moment, System, UsualRecording
 
 
 class PendulumSystem(System):
-    """A rigid body on a horizontal hinge: inertia q'' = u - mass gravity length sin q.
+    """Rigid body on a horizontal hinge: inertia q'' = u - mass gravity length sin q.
 
     States are the angle q [rad], 0 when hanging, and its rate qd [rad/s].
     """
@@ -56,22 +56,33 @@ class PendulumSystem(System):
     usual_recording = UsualRecording(initial={"q": (0.5, 1.5)})
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """(L, 1) kg m^2 about the hinge."""
+        """Return the inertia (L, 1) about the hinge in kg m^2.
+
+        Args:
+            theta: (L, p) parameters.
+            constants: (L, 1) constants by name.
+        """
         return theta[:, :1]
 
     def weight(self, moment: Moment) -> Array:
-        """Gravity's torque."""
+        """Return the torque of gravity (L, 1)."""
         k = moment.constants
         torque: Array = -k["mass"] * k["gravity"] * k["length"] * np.sin(moment.x)
         return torque
 
     def drive(self, moment: Moment) -> Array:
-        """The input torque."""
+        """Return the input torque (L, 1)."""
         return moment.inputs["u"]
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
-        """It swings in the plane of x and the vertical; what pushes along the hinge's axis is held
-        by it.
+        """Return the torque (L, 1) of 1 m/s^2 of horizontal acceleration.
+
+        The pendulum swings in the plane of x and the vertical; the hinge supports forces along its
+        axis.
+
+        Args:
+            moment: state snapshot.
+            axis: horizontal axis of the acceleration.
         """
         if axis == "y":
             return np.zeros_like(moment.x)
@@ -81,5 +92,12 @@ class PendulumSystem(System):
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """Angle and rate."""
+        """Return angle and rate.
+
+        Args:
+            x: (L, S, D) positions.
+            v: (L, S, D) velocities.
+            a: (L, S, D) accelerations.
+            constants: constants by name.
+        """
         return {"q": x[:, :, 0], "qd": v[:, :, 0]}

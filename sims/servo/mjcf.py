@@ -1,7 +1,7 @@
-"""The servo as MJCF: a position servo with a limit of its force, on a joint that carries a mass.
+"""Servo as an MJCF model file: a force-limited position servo on a joint that carries a mass.
 
 With K = kt / R, torque = clip(K voltage kp error_gain (goal - q), -K voltage, K voltage) - K kt q':
-the second part is the motor's own voltage, which damps the joint while it is driven.
+the second part is the back electromotive force, which damps the joint while the motor is driven.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ TEXT = """<mujoco model="servo">
 </mujoco>
 """
 POINT = 1e-9
-"""kg m^2 about its centre of mass of what is a point: MuJoCo wants more than zero."""
+"""Inertia in kg m^2 of a point mass about its centre: MuJoCo requires a positive value."""
 
 
 def model_file(numbers: Mapping[str, float]) -> ModelFile:
-    """The servo with these parameters and constants."""
+    """Return the model file of the servo with these parameters and constants."""
     k = numbers
     stall = k["torque_constant"] * k["voltage"] / k["resistance"]
     text = TEXT.format(

@@ -1,11 +1,11 @@
-"""The servo as a registered simulator."""
+"""Registered simulator of the servo."""
 
 from sims.servo.system import ServoSystem
 from sims.simulated import Simulated
 
 
 class Servo(Simulated):
-    """A servo; see `ServoSystem`."""
+    """Servo; see `ServoSystem`."""
 
     system = ServoSystem
     default_engine = "pybullet"

@@ -1,4 +1,4 @@
-"""The servo: a position-controlled motor that carries a pendulum."""
+"""Servo: a position-controlled motor that carries a pendulum."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from sims.system import Derived, Effect, Kind, ModelFile, Moment, System, UsualR
 _KT = slice(0, 1)
 """Column of the torque constant among the parameters."""
 _RESISTANCE = slice(1, 2)
-"""Column of the winding's resistance."""
+"""Column of the winding's resistance among the parameters."""
 _ARMATURE = slice(2, 3)
-"""Column of the inertia of motor and gears."""
+"""Column of the inertia of motor and gears among the parameters."""
 
 
 class ServoSystem(System):
-    """A pendulum on a motor with a proportional position controller.
+    """Pendulum on a motor with a proportional position controller.
 
         (armature + mass length^2) q'' = torque - mass gravity length sin q    (1)
         duty = clip(kp error_gain (goal - q), -1, 1)                           (2)
@@ -119,28 +119,35 @@ class ServoSystem(System):
 
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:
-        """See `System`."""
+        """Return why the servo cannot have an effect; see `System`."""
         return "its input is a set point, not a force" if effect.name == "input.power" else ""
 
     @classmethod
     def model_file(cls, numbers: Mapping[str, float]) -> ModelFile:
-        """See `System`; the duty is clipped before the motor's own voltage is taken off, which is
-        thus a damping of the joint, behind the limit of the servo's force.
+        """Return the servo as a model file; see `System`.
+
+        The duty is limited before the back electromotive force is subtracted. Therefore the latter
+        is a damping of the joint, outside the limit of the servo's force.
         """
         return model_file(numbers)
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """(L, 1) kg m^2 about the joint."""
+        """Return the inertia (L, 1) about the joint in kg m^2.
+
+        Args:
+            theta: (L, p) parameters.
+            constants: (L, 1) constants by name.
+        """
         return theta[:, _ARMATURE] + constants["mass"] * constants["length"] ** 2  # (1)
 
     def weight(self, moment: Moment) -> Array:
-        """Gravity's torque."""
+        """Return the torque of gravity (L, 1)."""
         k = moment.constants
         torque: Array = -k["mass"] * k["gravity"] * k["length"] * np.sin(moment.x)
         return torque
 
     def drive(self, moment: Moment) -> Array:
-        """The motor's torque, with its own back electromotive force."""
+        """Return the motor's torque (L, 1), including its back electromotive force."""
         k = moment.constants
         kt = moment.theta[:, _KT]
         error = moment.inputs["goal"] - moment.x
@@ -151,7 +158,14 @@ class ServoSystem(System):
         return np.where(moment.inputs["torque_enable"] > 0.5, torque, 0.0)
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
-        """The pendulum swings in the plane of x and the vertical."""
+        """Return the torque (L, 1) of 1 m/s^2 of horizontal acceleration.
+
+        The pendulum swings in the plane of x and the vertical.
+
+        Args:
+            moment: state snapshot.
+            axis: horizontal axis of the acceleration.
+        """
         if axis == "y":
             return np.zeros_like(moment.x)
         torque: Array = moment.constants["mass"] * moment.constants["length"] * np.cos(moment.x)
@@ -160,5 +174,12 @@ class ServoSystem(System):
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """The encoder's angle."""
+        """Return the angle of the encoder.
+
+        Args:
+            x: (L, S, D) positions.
+            v: (L, S, D) velocities.
+            a: (L, S, D) accelerations.
+            constants: constants by name.
+        """
         return {"q": x[:, :, 0]}

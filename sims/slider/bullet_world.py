@@ -1,5 +1,6 @@
-"""The slider's world in Bullet: a body on a guide along x, without gravity, which the guide would
-carry.
+"""World of the slider in Bullet: a body on a guide along x.
+
+There is no gravity, which the guide would support.
 """
 
 from __future__ import annotations
@@ -9,11 +10,16 @@ from collections.abc import Callable, Mapping
 from sims import bullet
 
 OPEN_LOOP = True
-"""The force is the input, whatever the motion."""
+"""Whether the force depends on the input alone."""
 
 
 def build(client: int, constants: Mapping[str, float]) -> int:  # noqa: ARG001
-    """A guide with one body on it; returns the body's id."""
+    """Build a guide with one body; return the body's id.
+
+    Args:
+        client: Bullet client of an empty world.
+        constants: constants of the system by name.
+    """
     return bullet.joint(
         client, bullet.engine().JOINT_PRISMATIC, (1.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0)
     )
@@ -25,7 +31,14 @@ def load(
     inertia: float,
     constants: Mapping[str, float],  # noqa: ARG001
 ) -> bool:
-    """Give the body this mass; False if there is no such mass."""
+    """Set the body's mass; return False if it is not positive.
+
+    Args:
+        client: Bullet client of the world.
+        body: id of the body.
+        inertia: generalised inertia in kg or kg*m^2.
+        constants: constants of the system by name.
+    """
     if not inertia > 0.0:
         return False
     bullet.engine().changeDynamics(body, 0, mass=inertia, physicsClientId=client)
@@ -33,5 +46,5 @@ def load(
 
 
 def gravity(constants: Mapping[str, float]) -> Callable[[float], float]:  # noqa: ARG001
-    """None along the guide."""
+    """Return a function that gives zero, because gravity does not act along the guide."""
     return lambda x: 0.0  # noqa: ARG005

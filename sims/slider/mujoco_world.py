@@ -1,5 +1,6 @@
-"""The slider's world in MuJoCo: a body on a guide along x, without gravity, which the guide would
-carry.
+"""World of the slider in MuJoCo: a body on a guide along x.
+
+There is no gravity, which the guide would support.
 """
 
 from __future__ import annotations
@@ -8,12 +9,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 OPEN_LOOP = True
-"""The force is the input, whatever the motion."""
+"""Whether the force depends on the input alone."""
 
 
 def model(constants: Mapping[str, float]) -> str:  # noqa: ARG001
-    """The world as MJCF. The body hangs below the guide, since MuJoCo keeps the mass of one at its
-    joint's origin.
+    """Return the world as MJCF.
+
+    The body hangs below the guide, because MuJoCo does not update the mass of a body at its joint's
+    origin.
     """
     return """
     <mujoco>
@@ -28,11 +31,17 @@ def model(constants: Mapping[str, float]) -> str:  # noqa: ARG001
 
 
 def load(model: Any, inertia: float, constants: Mapping[str, float]) -> bool:  # noqa: ARG001
-    """Give the body this mass; False if there is no such mass."""
+    """Set the body's mass; return False if it is not positive.
+
+    Args:
+        model: compiled model (``MjModel``).
+        inertia: generalised inertia in kg or kg*m^2.
+        constants: constants of the system by name.
+    """
     model.body_mass[1] = inertia
     return inertia > 0.0
 
 
 def gravity(constants: Mapping[str, float]) -> Callable[[float], float]:  # noqa: ARG001
-    """None along the guide."""
+    """Return a function that gives zero, because gravity does not act along the guide."""
     return lambda x: 0.0  # noqa: ARG005

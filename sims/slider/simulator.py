@@ -1,11 +1,11 @@
-"""The slider as a registered simulator."""
+"""Registered simulator of the slider."""
 
 from sims.simulated import Simulated
 from sims.slider.system import SliderSystem
 
 
 class Slider(Simulated):
-    """A slider; see `SliderSystem`."""
+    """Slider; see `SliderSystem`."""
 
     system = SliderSystem
     default_engine = "pybullet"

@@ -1,4 +1,4 @@
-"""The slider: a mass that a force pushes along a straight level guide."""
+"""Slider: a mass that a force pushes along a straight level guide."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ from sims.base import Array, Channel, Parameter
 from sims.system import Effect, Kind, Moment, System, UsualRecording
 
 LOADED = ("friction.load_direction", "friction.load_quadratic")
-"""Effects that tell the drive from what it works against."""
+"""Effects that distinguish drive and load; they are not available, as the slider has no load."""
 
 
 class SliderSystem(System):
-    """mass x'' = u. States are the position x [m] and its rate v [m/s]."""
+    """Mass on a guide: mass x'' = u.
+
+    States are the position x [m] and its rate v [m/s].
+    """
 
     name = "slider"
     says = "a mass that a force pushes along a level guide"
@@ -35,27 +38,49 @@ class SliderSystem(System):
 
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:
-        """See `System`; with nothing to work against they would be `friction.load` itself."""
+        """Return why the slider cannot have an effect; see `System`.
+
+        Without a load, the effects of `LOADED` would be equivalent to `friction.load`.
+        """
         return "nothing works against its drive" if effect.name in LOADED else ""
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """(L, 1) kg."""
+        """Return the mass (L, 1) in kg.
+
+        Args:
+            theta: (L, p) parameters.
+            constants: (L, 1) constants by name.
+        """
         return theta[:, :1]
 
     def weight(self, moment: Moment) -> Array:
-        """Zero: the guide is level."""
+        """Return zero, because the guide is level."""
         return np.zeros_like(moment.x)
 
     def drive(self, moment: Moment) -> Array:
-        """The input force."""
+        """Return the input force (L, 1)."""
         return moment.inputs["u"]
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
-        """The guide runs along x; what pushes across it is held by it."""
+        """Return the force (L, 1) of 1 m/s^2 of horizontal acceleration.
+
+        The guide runs along x and supports forces across it.
+
+        Args:
+            moment: state snapshot.
+            axis: horizontal axis of the acceleration.
+        """
         return moment.theta[:, :1] if axis == "x" else np.zeros_like(moment.x)
 
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """Position and rate."""
+        """Return position and rate.
+
+        Args:
+            x: (L, S, D) positions.
+            v: (L, S, D) velocities.
+            a: (L, S, D) accelerations.
+            constants: constants by name.
+        """
         return {"x": x[:, :, 0], "v": v[:, :, 0]}

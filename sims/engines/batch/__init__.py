@@ -1,8 +1,8 @@
-"""The project's own engine: many lanes of a small system at once, in numpy.
+"""Batch engine of the project: many simulations of a small system together, in NumPy.
 
-Each lane's motion is computed from that lane alone, so it does not depend, bit for bit, on what
-else is in the call, and an effect that is off in a lane changes nothing there. Lanes on which only
-a constant force acts fly in closed form (`parabola`); the others are stepped (`stepping`).
+The trajectory of each batch element depends on that element alone, bit for bit, and an effect that
+is inactive on an element changes nothing there. Elements on which only a constant force acts are
+integrated in closed form (`parabola`); the others are stepped (`stepping`).
 """
 
 from __future__ import annotations
@@ -26,28 +26,32 @@ if TYPE_CHECKING:
 
 REQUIRES: tuple[str, ...] = ()
 TIME_STEP = 5e-3
-"""Longest step in seconds where the user sets none."""
+"""Default longest step in seconds."""
 FEW = 3
-"""Lanes whose steps are divided into more parts are stepped apart from the others."""
+"""Maximum number of parts per step of elements that are stepped together.
+
+Elements whose steps are divided into more parts are stepped separately.
+"""
 
 
 class Batch:
-    """Integrates lanes of any system.
+    """Engine that integrates batches of any system.
 
     Args:
-        time_step: longest step in seconds; steps are shorter where a lane's motion is too fast for
-            it.
-        turn: radians by which an oscillation may turn in a step; see `sims.engines.batch.pace`.
-        patience: a lane is given up, and NaN, that needs so many times the planned steps; so a
-            search through forces that bend sharply at every reversal never waits for what is no
-            answer. Without a limit by default.
-        compiled: whether lanes are stepped by machine code (`sims.engines.compiled`) where there is
-            a compiler and what acts on them compiles; else in numpy, to the same numbers but for
-            rounding.
-        jobs: threads on which machine code steps many lanes; the numbers do not depend on it.
+        time_step: longest step in seconds; steps are shorter where the motion of an element is too
+            fast for it.
+        turn: maximum phase in radians of an oscillation per step; see `sims.engines.batch.pace`.
+        patience: maximum number of steps of an element, as a multiple of the planned ones; beyond
+            it, the element becomes NaN. It bounds the time of a search through forces that are
+            strongly nonlinear at every reversal. The default is no limit.
+        compiled: whether machine code (`sims.engines.compiled`) steps the elements if a compiler is
+            available and the effects can be compiled; otherwise NumPy is used, with results equal
+            up to rounding.
+        jobs: number of threads on which machine code steps many elements; the results do not depend
+            on it.
 
     Raises:
-        InputError: a setting that is not a positive number.
+        InputError: a setting is not a positive number.
     """
 
     name = "batch"
@@ -82,13 +86,13 @@ class Batch:
         self._jobs = jobs
 
     def integrate(self, lanes: Lanes) -> Motion:
-        """Integrate every lane over its steps; a lane whose numbers overflow is NaN throughout."""
+        """Integrate every element over its steps; an element that overflows is NaN throughout."""
         with np.errstate(all="ignore"):
             moved, order = _sorted(lanes, self._machine(lanes) is None)
             if not moved.any():
                 motion = self._moved(lanes)
             else:
-                # Lanes in free flight apart from the others: in closed form they take no steps.
+                # Elements in free flight are separated, because they need no steps in closed form.
                 kinds = moved[order]
                 flown = order[~kinds]
                 stepped = order[kinds]
@@ -96,7 +100,8 @@ class Batch:
                 if flown.size:
                     motions.insert(0, (flown, self._moved(take(lanes, flown))))
                 motion = joined(motions, lanes)
-        # What is not finite stays so, so the last state tells of the whole run.
+        # Values that are not finite stay so; therefore the last state shows whether the whole run
+        # is.
         there = np.isfinite(motion.x[:, -1])
         moving = np.isfinite(motion.v[:, -1])
         lost = ~(there & moving).all(axis=1)
@@ -106,7 +111,7 @@ class Batch:
         return motion
 
     def _stepped(self, lanes: Lanes) -> Motion:
-        """The motion of lanes that are all stepped, sorted by what acts in them."""
+        """Return the trajectories of stepped elements, sorted by their active effects."""
         made = self._machine(lanes)
         if made is None:
             return self._moved(lanes)
@@ -114,23 +119,23 @@ class Batch:
 
         motion, left = step(lanes, self._turn, self._patience, made, self._jobs)
         if left.size:
-            # What does not compile is stepped here, beside what does.
+            # Elements that cannot be compiled are stepped in NumPy.
             part = self._moved(take(lanes, left))
             for whole, values in ((motion.x, part.x), (motion.v, part.v), (motion.a, part.a)):
                 whole[left] = values
         return motion
 
     def _machine(self, lanes: Lanes) -> Machine | None:
-        """The machine code that steps lanes; None where numpy does."""
+        """Return the compiled kernel that steps the elements; None where NumPy does."""
         if not (self._compiled and lanes.steps.shape[1]):
             return None
-        # Loaded when something is stepped: the compiler's package is not for free.
+        # The module is imported on first use, because the compiler's package is slow to import.
         from sims.engines.compiled import machine
 
         return machine.machine()
 
     def _moved(self, lanes: Lanes) -> Motion:
-        """The motion of lanes that are all stepped or all in free flight."""
+        """Return the trajectories of elements that are either all stepped or all in free flight."""
         field = Field(lanes)
         ground = Ground(lanes) if lanes.system.bounces else None
         if field.free:
@@ -140,7 +145,7 @@ class Batch:
         spans = np.max(lanes.steps, axis=1, keepdims=True, initial=0.0)
         parts = divisions(lanes, field, spans, self._turn)
         slow = (parts > FEW)[:, 0]
-        # Few lanes in many short steps would keep the others waiting in every one.
+        # A few elements with many short steps would delay all others at every step.
         if slow.any() and not slow.all():
             groups = np.flatnonzero(~slow), np.flatnonzero(slow)
             motions = [(group, self._moved(take(lanes, group))) for group in groups]
@@ -148,11 +153,11 @@ class Batch:
         return Stepping(lanes, field, ground, spans, parts).run(self._patience)
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
-        """Nothing: it carries every system."""
+        """Return an empty text: the engine can integrate every system."""
         return ""
 
     def close(self) -> None:
-        """It holds nothing."""
+        """Do nothing: the engine holds no resources."""
 
 
 def engine(
@@ -164,13 +169,27 @@ def engine(
     compiled: bool = True,
     jobs: int = 1,
 ) -> Batch:
-    """A new engine; see `Batch`."""
+    """Make a new batch engine.
+
+    Args:
+        system: system that the engine will integrate.
+        time_step: longest step in seconds.
+        turn: maximum phase in radians of an oscillation per step.
+        patience: maximum number of steps of an element, as a multiple of the planned ones.
+        compiled: whether to use machine code where possible.
+        jobs: number of threads of the machine code.
+
+    Returns:
+        The engine; see `Batch`.
+    """
     return Batch(time_step, turn, patience, compiled, jobs)
 
 
 def _sorted(lanes: Lanes, for_numpy: bool) -> tuple[Mask, Indices]:
-    """(L,) whether more than a constant force acts in a lane; lanes in the order of what acts in
-    them where numpy steps them.
+    """Return which elements (L,) need steps, and the order in which elements are integrated.
+
+    An element needs steps if more than a constant force acts on it. If NumPy steps them, elements
+    are ordered by their active effects.
     """
     forces = [acts(c) for effect, c in lanes.effects if isinstance(effect, (Force, Friction))]
     steps = not lanes.system.uniform
@@ -178,6 +197,6 @@ def _sorted(lanes: Lanes, for_numpy: bool) -> tuple[Mask, Indices]:
     if not forces:
         return np.full(len(own), steps), own
     moved: Mask = np.any(forces, axis=0) | steps
-    # In numpy lanes with the same effects lie together, so that each effect is asked for a short
-    # span; machine code groups lanes itself, and in their own order none has to be copied.
+    # In NumPy, elements with the same effects are adjacent, so that each effect is evaluated on a
+    # short span. Machine code groups elements itself, and without reordering none must be copied.
     return moved, np.lexsort(forces) if for_numpy else own

@@ -1,4 +1,4 @@
-"""Which step each lane is in, what it feels there, and which of its states are kept."""
+"""Time, inputs and recorded states of each batch element."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from sims.system import Lanes, Motion
 
 
 class Clock:
-    """A clock for every lane.
+    """Clock of every batch element.
 
-    While all lanes are in the same step they are served by whole rows; from the first time that
-    they differ, one by one.
+    While all elements are in the same step, whole rows are read and written. From the first time
+    that they differ, elements are handled one by one.
 
     Attributes:
         t: (L, 1) seconds since the start of the run.
-        left: (L, 1) seconds to the end of the lane's step.
-        over: whether every lane has made all its steps.
+        left: (L, 1) seconds to the end of the element's step.
+        over: whether every element has made all its steps.
     """
 
     def __init__(self, lanes: Lanes) -> None:
         count, self._end = lanes.steps.shape
-        # Lanes that share their steps share the row: a stride of zero says that it is one row.
+        # Elements with the same steps share one row: a stride of zero shows that there is only one
+        # row.
         steps = lanes.steps[:1] if lanes.steps.strides[0] == 0 else lanes.steps
         none = np.zeros((1, len(steps)))
         ends = np.cumsum(steps, axis=1)
-        # One row a step, and one of zeros behind the last, in which finished lanes wait. Rows must
-        # lie together: they are looked up by place.
+        # There is one row per step, and a last row of zeros in which finished elements wait. The
+        # arrays must be contiguous, because values are looked up by flat index.
         self._steps = np.ascontiguousarray(np.concatenate([steps.T, none]))
         self._starts = np.ascontiguousarray(np.concatenate([none, ends.T]))
         self._inputs = {}
@@ -50,7 +51,7 @@ class Clock:
         self.left[:, 0] = self._steps[0]
 
     def inputs(self) -> dict[str, Array]:
-        """(L, 1) by name; behind the last step, the last."""
+        """Return the inputs (L, 1) by name; after the last step, those of the last step."""
         if self._common is not None:
             row = min(self._common, self._end - 1)
             return {name: values[row][:, None] for name, values in self._inputs.items()}
@@ -58,10 +59,10 @@ class Clock:
         return {name: values[rows, self._lane][:, None] for name, values in self._inputs.items()}
 
     def keep(self, state: Array) -> None:
-        """Keep the state (3 D, L) of lanes that begin a step behind a sample."""
+        """Record the state (3 D, L) of elements that begin a step at a sample time."""
         if self._common is not None:
             if self._common % self._every == 0:
-                # Whole rows, without looking for lanes: most calls never leave this branch.
+                # Whole rows, without search for elements: most calls never leave this branch.
                 self._kept[self._common // self._every] = state.T
             return
         due = self._step % self._every == 0
@@ -71,7 +72,7 @@ class Clock:
             self._kept[records, lanes] = state[:, lanes].T
 
     def finish(self, ended: Mask | None = None) -> None:
-        """Lanes `ended` (L,), or all, go on to their next step."""
+        """Advance the elements `ended` (L,), or all, to their next step."""
         if ended is not None and not ended.all():
             self._part()
         if self._common is not None:
@@ -81,7 +82,7 @@ class Clock:
             self.t[:, 0] = self._starts[self._common]
             return
         assert ended is not None
-        # A lane that has made all its steps goes on to no other: it would run off the table.
+        # A finished element must not advance: it would run past the end of the table.
         ended = ended & (self._step < self._end)
         self._begins = ended
         if ended.any():
@@ -94,24 +95,28 @@ class Clock:
             self.over = bool(self._step.min() == self._end)
 
     def spend(self, h: Array) -> None:
-        """Let h (L, 1) seconds pass, at most what is left."""
+        """Advance the time by h (L, 1) seconds, at most to the end of the step."""
         self.t += h
-        # Steps add up to a little more than what was left; a rest below zero would run backwards.
+        # By rounding, parts of a step may add up to more than its length; a negative rest would run
+        # backwards in time.
         self.left = np.maximum(self.left - h, 0.0)
 
     def _part(self) -> None:
-        """From now on lanes are served one by one."""
+        """Handle elements one by one from now on."""
         if self._common is not None:
             self._step[:] = self._common
             self._common = None
 
     def give_up(self, lanes: Mask, state: Array) -> None:
-        """Lanes (L,) have made their last step; keep the state (3 D, L) as what is behind their
-        last sample.
+        """End the integration of some elements.
+
+        Args:
+            lanes: (L,) elements to end.
+            state: (3 D, L) state that is recorded as that of the last sample.
         """
         self._part()
         self._step[lanes] = self._end
-        # The engine tells lost lanes by the last state that was kept.
+        # The engine recognises failed elements by their last recorded state.
         self._kept[-1, lanes] = state[:, lanes].T
         self.left[lanes] = 0.0
         self.t[lanes] = 0.0
@@ -119,11 +124,11 @@ class Clock:
         self.over = bool(self._step.min() == self._end)
 
     def correct(self, lanes: Indices, h: Array) -> None:
-        """Move the clocks of some lanes (n,) by h (n, 1) seconds."""
+        """Move the clocks of the elements `lanes` (n,) by h (n, 1) seconds."""
         self.t[lanes] += h
         self.left[lanes] = np.maximum(self.left[lanes] - h, 0.0)
 
     def motion(self) -> Motion:
-        """What was kept."""
+        """Return the recorded trajectories."""
         x, v, a = np.split(self._kept.transpose(1, 0, 2), 3, axis=2)
         return Motion(x, v, a)

@@ -1,16 +1,16 @@
-"""Accelerations during a step: forces, dry friction, and the ground that bears what rests on it.
+"""Accelerations within a step: forces, dry friction, and the ground that supports resting bodies.
 
-Dry friction opposes motion with all of its limit. Its direction is held during a step, so that the
-step is smooth. A lane that is still sticks while what pulls is within the limit, else it slips
-where it is pulled. With generalised inertia M, pull F (all forces but friction), limit L and the
-unit vector d of the motion,
+Dry friction opposes motion with its full limit. Its direction is fixed during a step, so that the
+step is smooth. An element at rest sticks while the pulling force is within the limit, otherwise it
+slips in the direction of that force. With generalised inertia M, pulling force F (all forces except
+dry friction), limit L and the unit vector d of the motion,
 
     M a = F - L d          while it moves, d = v / |v|                     (1)
     a = 0                  at rest, as long as |F| <= L                    (2)
     M a = F - L F / |F|    at rest, where |F| > L                          (3)
 
 (C. Coulomb's law; see E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations
-I, 1993, section II.6, on such discontinuities: a step must not reach across one).
+I, 1993, section II.6, on such discontinuities: a step must not extend across one).
 """
 
 from __future__ import annotations
@@ -23,16 +23,15 @@ from sims.engines.ground import Indices
 
 
 class Dynamics:
-    """Accelerations of lanes during their steps.
+    """Accelerations of batch elements during their steps.
 
     Attributes:
-        rests: (L, 1) lanes that lie on the ground.
-        sticks: (L, 1) lanes that dry friction holds during the present step.
-        way: (L, D) direction of motion at the beginning of the present step; unit vectors.
-        rubs: (L, D) dry friction at each instant asked for since the present step began, had it
-            acted against motion.
-        excess: (L, 1) by how much what pulled exceeded the limit, at the beginning of the step and
-            in the last call.
+        rests: (L, 1) elements that rest on the ground.
+        sticks: (L, 1) elements that dry friction holds during the present step.
+        way: (L, D) unit vectors of the direction of motion at the beginning of the present step.
+        rubs: (L, D) dry friction of sliding motion at each evaluation since the present step began.
+        excess: (L, 1) pulling force minus friction limit, at the beginning of the step and in the
+            last call.
     """
 
     def __init__(self, field: Field, shape: tuple[int, int]) -> None:
@@ -47,8 +46,14 @@ class Dynamics:
         self._along_guide = np.arange(shape[1]) < field.guided
 
     def begin(self, t: Array, x: Array, v: Array) -> Array:
-        """(L, D) acceleration at the beginning of a step; decides what sticks and which way the
-        rest moves.
+        """Return the acceleration (L, D) at the beginning of a step.
+
+        It also determines which elements stick, and the direction of motion of the others.
+
+        Args:
+            t: (L, 1) times in seconds.
+            x: (L, D) positions.
+            v: (L, D) velocities.
         """
         pull = self._borne(t, x, v)
         if not self.field.dry:
@@ -61,8 +66,8 @@ class Dynamics:
         self.excess = (excess, excess)
         self.rubs = []
         self.sticks = still & (size <= limit) & self.field.rubs  # (2)
-        # (1) and (3): along the motion, or where there is none along what pulls; a lane without
-        # either has no direction, and must not divide by zero.
+        # (1) and (3): along the motion, or at rest along the pulling force. An element with neither
+        # has no direction, and the division by zero must be avoided.
         pulled = np.where(size > 0, size, 1.0)
         self.way = np.where(still, pull, v) / np.where(still, pulled, speed)
         if self._guided < v.shape[1]:
@@ -70,7 +75,13 @@ class Dynamics:
         return self._rubbed(pull, limit, self.way)
 
     def during(self, t: Array, x: Array, v: Array) -> Array:
-        """(L, D) acceleration within the step that was begun last."""
+        """Return the acceleration (L, D) within the present step.
+
+        Args:
+            t: (L, 1) times in seconds.
+            x: (L, D) positions.
+            v: (L, D) velocities.
+        """
         pull = self._borne(t, x, v)
         if not self.field.dry:
             return pull / self.field.mass
@@ -79,38 +90,41 @@ class Dynamics:
         return self._rubbed(pull, limit, self._along(v))
 
     def halted(self, v: Array, faint: Array) -> Array:
-        """Velocities v (n, D) with none along the guide where it is no larger than `faint`
-        (n, 1).
+        """Return velocities (n, D) without their part along the guide where it is negligible.
+
+        Args:
+            v: (n, D) velocities.
+            faint: (n, 1) largest negligible speed.
         """
         return np.where((self.size(v) <= faint) & self._along_guide, 0.0, v)
 
     def lay(self, lanes: Indices) -> None:
-        """These lanes (n,) rest on the ground from now on."""
+        """Mark the elements `lanes` (n,) as resting on the ground."""
         self.rests[lanes] = True
         self._any_rests = True
 
     def lift(self, v: Array) -> None:
-        """Lanes that move up, v (L, D), rest no longer."""
+        """Clear the resting state of elements that move upward, v (L, D)."""
         if self._any_rests:
             self.rests &= v[:, -1:] <= 0
             self._any_rests = bool(self.rests.any())
 
     def _borne(self, t: Array, x: Array, v: Array) -> Array:
-        """Forces but for dry friction, without what the ground takes."""
+        """Return all forces except dry friction, without the part that the ground supports."""
         pull = self.field.force(t, x, v)
         if self._any_rests:
-            pull = pull + 0.0  # a copy: a constant force is the same array at every instant
-            # The ground pushes and does not pull: what lifts the lane is left to it.
+            pull = pull + 0.0  # a copy: a constant force is the same array in every call
+            # The ground pushes but does not pull: an upward force remains.
             lift = pull[:, -1:]
             pull[:, -1:] = np.where(self.rests, np.maximum(lift, 0.0), lift)
         return pull
 
     def _along(self, v: Array) -> Array:
-        """Directions of v, turned to the side of the direction at the beginning."""
+        """Return the directions of v, with signs that agree with the direction at the beginning."""
         if self._guided == 1:
             return self.way
-        # In a plane the direction may turn within the step, but not over to the other side: that
-        # is a reversal, which the step is cut for.
+        # In a plane the direction may turn within the step, but must not reverse: a reversal is an
+        # event at which the step is cut.
         speed = length(v)
         divisor = np.where(speed > 0, speed, 1.0)
         unit = np.where(speed > 0, v / divisor, self.way)
@@ -120,18 +134,18 @@ class Dynamics:
 
     def _rubbed(self, pull: Array, limit: Array, way: Array) -> Array:
         friction = limit * way
-        self.rubs.append(friction)  # four a step, from which it is told how friction bends
+        self.rubs.append(friction)  # four per step, from which its nonlinearity is estimated
         slipping = (pull - friction) / self.field.mass
         result: Array = np.where(self.sticks & self._along_guide, 0.0, slipping)
         return result
 
     def size(self, v: Array) -> Array:
-        """(n, 1) magnitudes along the guide."""
+        """Return the magnitudes (n, 1) along the guide."""
         return length(v[:, : self._guided])
 
 
 def dot(a: Array, b: Array) -> Array:
-    """(L, 1) inner products."""
+    """Return the inner products (L, 1)."""
     if a.shape[1] == 1:
         return a * b
     result: Array = (a * b).sum(axis=1, keepdims=True)
@@ -139,7 +153,7 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def length(v: Array) -> Array:
-    """(L, 1) magnitudes."""
+    """Return the magnitudes (L, 1)."""
     if v.shape[1] == 1:
         return np.abs(v)
     result: Array = np.sqrt((v * v).sum(axis=1, keepdims=True))

@@ -1,8 +1,8 @@
-"""Forces of the batch engine: what accelerates every lane at one instant.
+"""Generalised forces of the batch engine, from the system and the effects on it.
 
-Lanes come sorted by the effects that act in them, so that each effect is asked for the span of
-lanes between the first and the last one it acts in. Whatever is computed for a lane is computed
-from that lane alone.
+Batch elements are sorted by their active effects. Each effect is evaluated for the span between the
+first and the last element on which it is active. Every value of an element depends on that element
+alone.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from sims.system import Effect, Force, Friction, Lanes, Moment
 
 @dataclass
 class Share:
-    """One effect, in the span of lanes where it acts.
+    """One effect, on the span of batch elements where it is active.
 
     Attributes:
         effect: the effect.
         c: (K, n, 1) its coefficients in the span.
-        span: the lanes.
-        on: (n, 1) the lanes of the span in which it acts; None if it acts in all of them.
-        moment: what it sees.
-        whole: whether the span is all lanes.
+        span: span of elements.
+        on: (n, 1) elements of the span on which the effect is active; None for all of them.
+        moment: state snapshot of the span.
+        whole: whether the span includes all elements.
     """
 
     effect: Effect
@@ -38,7 +38,16 @@ class Share:
     whole: bool
 
     def look(self, t: Array, x: Array, v: Array) -> Moment:
-        """The span's part of an instant of all lanes."""
+        """Update the snapshot of the span from the states of all elements.
+
+        Args:
+            t: (L, 1) times in seconds.
+            x: (L, D) positions.
+            v: (L, D) velocities.
+
+        Returns:
+            The snapshot of the span.
+        """
         moment = self.moment
         span = self.span
         if self.whole:
@@ -52,25 +61,33 @@ class Share:
         return moment
 
     def added(self, total: Array, values: Array) -> Array:
-        """`total` of all lanes plus the span's values (n, D)."""
+        """Add the values of the span to a total.
+
+        Args:
+            total: (L, D) total of all elements.
+            values: (n, D) values of the span.
+
+        Returns:
+            The new total (L, D).
+        """
         if self.on is not None:
             values = np.where(self.on, values, 0.0)
         if self.whole:
             return total + values
-        # A copy, since `total` may be the constant force itself; in its own order of storage.
+        # A copy, since `total` may be the constant force itself; it keeps the memory order.
         total = np.copy(total, order="K")
         total[self.span] += values
         return total
 
 
 class Field:
-    """Generalised forces of a system and the effects on it, over lanes.
+    """Generalised forces of a system and its effects on a batch.
 
     Attributes:
         mass: (L, 1) generalised inertia.
-        guided: how many coordinates, the first ones, dry friction acts on.
-        rubs: (L, 1) in which lanes dry friction acts.
-        pushed: (L, 1) in which lanes other forces act that may bend sharply.
+        guided: number of coordinates, counted from the first, on which dry friction acts.
+        rubs: (L, 1) elements on which dry friction acts.
+        pushed: (L, 1) elements on which other forces act that may be strongly nonlinear.
     """
 
     def __init__(self, lanes: Lanes) -> None:
@@ -83,24 +100,24 @@ class Field:
         self.guided = lanes.system.guided or lanes.x.shape[1]
         self._none = np.zeros_like(self.mass)
         shares = _shares(lanes)
-        # With the effect beside its share: so much is known of which hook it has.
+        # Each part is stored with its effect, so that type checkers know the effect's class.
         self._forces = [(s, s.effect) for s in shares if isinstance(s.effect, Force)]
         self._frictions = [(s, s.effect) for s in shares if isinstance(s.effect, Friction)]
         self.pushed = _where(self._forces, len(lanes.x)) | lanes.system.bends
         self.rubs = _where(self._frictions, len(lanes.x))
         self.feel({name: values[:, :1] for name, values in lanes.inputs.items()})
-        # What is the same everywhere and always is asked for once and not at every instant.
+        # A constant force is evaluated once, not at every step.
         start = self._at(self._moment.t, lanes.x, lanes.v)
         self._constant = _by_coordinate(lanes.system.force(start)) if lanes.system.uniform else None
 
     @property
     def free(self) -> bool:
-        """Whether nothing acts but a force that is the same everywhere and always."""
+        """Whether only a constant force acts, the same at all times and states."""
         return self._constant is not None and not self._forces and not self._frictions
 
     @property
     def dry(self) -> bool:
-        """Whether any dry friction acts."""
+        """Whether dry friction acts on any element."""
         return bool(self._frictions)
 
     def feel(self, inputs: Mapping[str, Array]) -> None:
@@ -110,7 +127,13 @@ class Field:
             share.moment.inputs = {name: values[share.span] for name, values in inputs.items()}
 
     def force(self, t: Array, x: Array, v: Array) -> Array:
-        """(L, D) generalised force but for dry friction."""
+        """Return the generalised force (L, D) without dry friction.
+
+        Args:
+            t: (L, 1) times in seconds.
+            x: (L, D) positions.
+            v: (L, D) velocities.
+        """
         total = self._constant
         if total is None:
             total = _by_coordinate(self._system.force(self._at(t, x, v)))
@@ -120,7 +143,13 @@ class Field:
         return total
 
     def limit(self, t: Array, x: Array, v: Array) -> Array:
-        """(L, 1) largest dry friction."""
+        """Return the limit of dry friction (L, 1).
+
+        Args:
+            t: (L, 1) times in seconds.
+            x: (L, D) positions.
+            v: (L, D) velocities.
+        """
         total = self._none
         for share, effect in self._frictions:
             limit = effect.limit(share.c, share.look(t, x, v))
@@ -128,7 +157,8 @@ class Field:
         return total
 
     def _at(self, t: Array, x: Array, v: Array) -> Moment:
-        # One moment for the whole run: making one anew costs as much as a small system's force.
+        # One snapshot serves the whole run: making a new one costs as much as a small system's
+        # force.
         self._moment.t = t
         self._moment.x = x
         self._moment.v = v
@@ -136,18 +166,18 @@ class Field:
 
 
 def acts(c: Array) -> Mask:
-    """(L,) in which lanes an effect with coefficients (K, L, 1) is not off."""
+    """Return whether an effect with coefficients (K, L, 1) is active on each element (L,)."""
     result: Mask = (c != 0).any(axis=(0, 2))
     return result
 
 
 def _by_coordinate(values: Array) -> Array:
-    """The same values (L, D) stored as the state is, so that they combine without strides."""
+    """Return values (L, D) in the memory order of the state, so that operations need no strides."""
     return values if values.shape[1] == 1 else np.asfortranarray(values)
 
 
 def _where(shares: Sequence[tuple[Share, Effect]], count: int) -> Mask:
-    """(L, 1) the lanes in which any of the effects acts."""
+    """Return on which elements (L, 1) any of the effects is active."""
     result = np.zeros((count, 1), dtype=bool)
     for share, _ in shares:
         result[share.span] |= True if share.on is None else share.on
@@ -160,7 +190,7 @@ def _shares(lanes: Lanes) -> list[Share]:
         on = acts(c)
         if not isinstance(effect, (Force, Friction)) or not on.any():
             continue
-        # From the first lane to the last: a slice is a view, a choice of lanes would be a copy.
+        # The span is contiguous, because a slice is a view, while a selection would be a copy.
         there = np.flatnonzero(on)
         first = int(there[0])
         last = int(there[-1])

@@ -1,15 +1,14 @@
-"""How long a lane's steps may be, from how fast its own motion changes.
+"""Step-size selection of the batch engine, from stiffness and damping of the motion.
 
-The forces are asked, at the lane's initial state and at rest at zero, at some instants of its run,
-how they answer to a small change of position and of velocity. Of x'' = -w^2 x - c x' the
-fourth-order method with step h turns by w h less its error of phase,
+At the initial state, and at rest at zero, the change of the forces with a small change of position
+and of velocity is computed for some steps of the run. For x'' = -w^2 x - c x', the fourth-order
+method with step h advances the phase by w h with an error of
 
     (w h)^5 / 120 + ...                                                    (1)
 
-(the first term of the exponential's series that it lacks: E. Hairer, S. P. Norsett, G. Wanner,
-Solving Ordinary Differential Equations I, 1993, section II.1). An oscillation may turn by `TURN`
-radians in a step, which keeps that error near 2e-7 of the phase; a decay may go through `DECAY` of
-its time, c h.
+(the first omitted term of the exponential's series: E. Hairer, S. P. Norsett, G. Wanner, Solving
+Ordinary Differential Equations I, 1993, section II.1). The phase may advance by `TURN` radians per
+step, which keeps that error near 2e-7 of the phase; a decay may have c h up to `DECAY`.
 """
 
 from __future__ import annotations
@@ -23,23 +22,28 @@ from sims.engines.batch.field import Field
 from sims.system import Lanes
 
 TURN = 0.07
-"""Radians by which an oscillation may turn in a step: (1) is then 2e-7 of the phase."""
+"""Maximum phase of an oscillation per step, in radians: error (1) is then 2e-7 of the phase."""
 DECAY = 0.5
-"""Time constants of a decay that a step may last."""
+"""Maximum step size in time constants of a decay."""
 DIVISIONS = 64
-"""Parts of a step at most."""
+"""Maximum number of parts into which a step is divided."""
 INSTANTS = 6
-"""Instants of a run at which the forces are asked, evenly over its steps."""
+"""Number of times in a run at which the forces are evaluated, evenly distributed over its steps."""
 NUDGE = 1e-5
-"""Change of position (m or rad) and of velocity (m/s or rad/s) over which slopes are taken."""
+"""Finite difference of position (m or rad) and of velocity (m/s or rad/s) for slopes."""
 
 
 def divisions(lanes: Lanes, field: Field, spans: Array, turn: float = TURN) -> Array:
-    """(L, 1) into how many parts steps of `spans` (L, 1) seconds must be divided; what cannot be
-    told is one.
+    """Return the number of parts (L, 1) into which the steps must be divided.
 
-    An oscillation then turns by `turn` radians in each at most, and decay is held to a share in
-    proportion.
+    An oscillation then advances by at most `turn` radians in each part, and a decay by at most a
+    proportional share. If no number can be computed, it is one.
+
+    Args:
+        lanes: batch to integrate.
+        field: forces on the batch.
+        spans: (L, 1) step sizes in seconds.
+        turn: maximum phase per step in radians.
     """
     parts = np.maximum(np.ceil(lanes.system.fastest * spans / turn), 1.0)
     for inputs in _instants(lanes):
@@ -47,16 +51,17 @@ def divisions(lanes: Lanes, field: Field, spans: Array, turn: float = TURN) -> A
         for x, v in ((lanes.x, lanes.v), (0.0 * lanes.x, 0.0 * lanes.v)):
             turning, decaying = _rates(field, x, v)
             turned = np.sqrt(turning) * spans  # w h, radians
-            decayed = decaying * spans * (TURN / DECAY)  # c h, in radians that count as much
+            decayed = decaying * spans * (TURN / DECAY)  # c h, scaled
             needed = np.maximum(turned, decayed) / turn
-            # `fmax` and not `maximum`: what overflows tells nothing, and one part will do.
+            # `fmax` instead of `maximum` ignores NaN from overflow; one part is then sufficient.
             parts = np.fmax(parts, np.ceil(needed))
     return np.minimum(parts, DIVISIONS)
 
 
 def _instants(lanes: Lanes) -> Iterator[dict[str, Array]]:
-    """Inputs of each lane at some of its own steps; waiting does not count, since it depends on the
-    others.
+    """Yield the inputs of each element at some of its steps.
+
+    Steps of zero length do not count, since they depend on the other elements.
     """
     if not lanes.inputs or not lanes.steps.size:
         yield {name: np.zeros((len(lanes.x), 1)) for name in lanes.inputs}
@@ -70,7 +75,16 @@ def _instants(lanes: Lanes) -> Iterator[dict[str, Array]]:
 
 
 def _rates(field: Field, x: Array, v: Array) -> tuple[Array, Array]:
-    """(L, 1) largest change of acceleration with position, 1/s^2, and with velocity, 1/s."""
+    """Return the largest slopes of the acceleration with position and with velocity.
+
+    Args:
+        field: forces on the batch.
+        x: (L, D) positions.
+        v: (L, D) velocities.
+
+    Returns:
+        Slopes (L, 1) with position in 1/s^2, and with velocity in 1/s.
+    """
     t = np.zeros_like(field.mass)
     base = field.force(t, x, v)
     turning = np.zeros_like(t)
@@ -79,7 +93,7 @@ def _rates(field: Field, x: Array, v: Array) -> tuple[Array, Array]:
         nudge = np.zeros_like(x)
         nudge[:, d] = NUDGE
         moved = field.force(t, x + nudge, v) - base
-        # Beside rest and not across it: what jumps there decays no faster for it.
+        # Both velocities are on one side of rest: a discontinuity at rest is not a faster decay.
         sped = field.force(t, x, v + nudge + nudge) - field.force(t, x, v + nudge)
         for change, largest in ((moved[:, d : d + 1], turning), (sped[:, d : d + 1], decaying)):
             slope = np.abs(change / (NUDGE * field.mass))

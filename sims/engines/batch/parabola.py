@@ -1,7 +1,7 @@
-"""Motion under a constant force, with bounces, in closed form: no steps at all.
+"""Closed-form motion under a constant force, with bounces, without steps.
 
-From impact to impact every coordinate is a parabola, so the engine goes from impact to impact, and
-then reads all samples off the parabolas at once. s seconds after x and v,
+Between impacts every coordinate is a parabola. The engine advances from impact to impact, and then
+evaluates all samples on the parabolas. A time s after state x, v,
 
     x(s) = x + v s + a s^2 / 2                                             (1)
     v(s) = v + a s                                                         (2)
@@ -10,7 +10,7 @@ and a ball at height H with upward speed u and downward acceleration g meets the
 
     s = (u + w) / g = 2 H / (w - u),    w = sqrt(u^2 + 2 g H)              (3)
 
-of which the first form loses digits where u < 0 and the second where u > 0 (W. H. Press et al.,
+of which the first form has cancellation for u < 0 and the second for u > 0 (W. H. Press et al.,
 Numerical Recipes, 3rd edition, 2007, section 5.6).
 """
 
@@ -27,7 +27,15 @@ from sims.system import Lanes, Motion
 
 @dataclass
 class Arcs:
-    """Parabolas x + v s + a s^2 / 2, s seconds after t: lanes (n,), t (n, 1); x, v, a (n, D)."""
+    """Parabolas x + v s + a s^2 / 2, a time s after t.
+
+    Attributes:
+        lanes: (n,) batch element of each parabola.
+        t: (n, 1) start times in seconds.
+        x: (n, D) positions at the start.
+        v: (n, D) velocities at the start.
+        a: (n, D) accelerations.
+    """
 
     lanes: Indices
     t: Array
@@ -36,7 +44,7 @@ class Arcs:
     a: Array
 
     def take(self, chosen: Mask) -> Arcs:
-        """Some of them."""
+        """Return the arcs selected by a mask (n,)."""
         return Arcs(
             lanes=self.lanes[chosen],
             t=self.t[chosen],
@@ -46,7 +54,7 @@ class Arcs:
         )
 
     def joined(self, others: list[Arcs]) -> Arcs:
-        """These and others, sorted by lane."""
+        """Return these arcs and others, sorted by batch element."""
         every = [self, *others]
         lanes = np.concatenate([arcs.lanes for arcs in every])
         order = np.argsort(lanes, kind="stable")
@@ -59,17 +67,27 @@ class Arcs:
 
 
 def fly(lanes: Lanes, a: Array, ground: Ground | None) -> Motion:
-    """The motion of lanes of constant acceleration `a` (L, D), over `ground` if there is any."""
+    """Integrate elements with constant acceleration, with impacts if there is a ground.
+
+    Args:
+        lanes: batch to integrate.
+        a: (L, D) accelerations.
+        ground: ground contact; None without ground.
+
+    Returns:
+        The trajectories.
+    """
     times = _kept_times(lanes)
     start = np.zeros((len(a), 1))
     first = Arcs(np.arange(len(a)), start, lanes.x, lanes.v, a)
     if ground is None:
         return _sampled(first, times)
-    first.x = first.x.copy()  # the caller's, which what begins in the ground must not change
+    first.x = first.x.copy()  # the caller's array must not be changed
     first.x[:, -1:] = np.maximum(first.x[:, -1:], ground.floor)
     arcs: list[Arcs] = []
     first = _begun(first, ground)
-    # What rests already has no impacts; the others lose one by one whose next impact is too late.
+    # Resting elements have no impacts; the others are removed when their next impact is after the
+    # end.
     moves = (first.a[:, -1] != 0) | (first.v[:, -1] != 0)
     now = first.take(moves)
     while now.lanes.size:
@@ -84,7 +102,7 @@ def fly(lanes: Lanes, a: Array, ground: Ground | None) -> Motion:
 
 
 def _kept_times(lanes: Lanes) -> Array:
-    """(L, R) instants of the states to be kept, or (1, R) if all lanes share them."""
+    """Return the times (L, R) of the recorded states, or (1, R) if all elements share them."""
     steps = lanes.steps[:1] if lanes.steps.strides[0] == 0 else lanes.steps
     start = np.zeros((len(steps), 1))
     times = np.concatenate([start, np.cumsum(steps, axis=1)], axis=1)
@@ -92,7 +110,7 @@ def _kept_times(lanes: Lanes) -> Array:
 
 
 def _begun(arcs: Arcs, ground: Ground) -> Arcs:
-    """The first arcs, with those that start on the ground thrown back or laid to rest."""
+    """Return the first arcs, with impact or rest of elements that start on the ground."""
     rate = arcs.v[:, -1]
     down = (arcs.x[:, -1] <= ground.floor[:, 0]) & (rate <= 0)
     if not down.any():
@@ -109,11 +127,11 @@ def _begun(arcs: Arcs, ground: Ground) -> Arcs:
 
 
 def _fall(arcs: Arcs, floor: Array) -> Array:
-    """(n, 1) seconds to the impact; infinite if there is none."""
+    """Return the seconds (n, 1) to the next impact; infinite if there is none."""
     high = arcs.x[:, -1:] - floor[arcs.lanes]
     up = arcs.v[:, -1:]
     down = -arcs.a[:, -1:]
-    root = np.sqrt(up * up + 2.0 * down * high)  # not a number if it turns back before
+    root = np.sqrt(up * up + 2.0 * down * high)  # NaN if it does not reach the ground
     rising = np.where(down > 0, (up + root) / down, np.inf)
     falling = 2.0 * high / (root - up)
     seconds = np.where(up < 0, falling, rising)  # (3)
@@ -122,21 +140,31 @@ def _fall(arcs: Arcs, floor: Array) -> Array:
 
 
 def _bounced(arcs: Arcs, s: Array, ground: Ground, a: Array) -> tuple[Arcs, Mask]:
-    """The arcs after the impact s (n, 1) seconds on, and which of them fly again."""
+    """Return the arcs after the impact.
+
+    Args:
+        arcs: arcs before the impact.
+        s: (n, 1) seconds from the start of the arc to the impact.
+        ground: ground contact.
+        a: (L, D) accelerations of free motion.
+
+    Returns:
+        The arcs after the impact, and which elements (n,) continue to bounce.
+    """
     x = arcs.x + s * (arcs.v + s * (0.5 * arcs.a))  # (1)
     outcome = ground.strike(arcs.lanes, arcs.v + s * arcs.a, arcs.a)  # (2)
-    x[:, -1:] = ground.floor[arcs.lanes]  # without the rounding of (1) and (3)
+    x[:, -1:] = ground.floor[arcs.lanes]  # removes the rounding of (1) and (3)
     after = a[arcs.lanes]
-    after[outcome.rests, -1] = 0.0  # the ground bears what rests on it
+    after[outcome.rests, -1] = 0.0  # the ground supports resting elements
     return Arcs(arcs.lanes, arcs.t + s, x, outcome.v, after), ~outcome.rests
 
 
 def _sampled(arcs: Arcs, times: Array) -> Motion:
-    """States at the instants times (L or 1, R), of arcs that are sorted by lane."""
+    """Return the states at times (L or 1, R), from arcs sorted by batch element."""
     lanes = int(arcs.lanes[-1]) + 1
     instants = times.shape[1]
-    # Each arc has the instants from its beginning to that of the next arc of its lane, or to the
-    # last one.
+    # Each arc covers the samples from its beginning to that of the next arc of its element, or to
+    # the last sample.
     begins = _places(times, arcs)
     same_lane = arcs.lanes[1:] == arcs.lanes[:-1]
     ends = np.append(np.where(same_lane, begins[1:], instants), instants)
@@ -152,19 +180,19 @@ def _sampled(arcs: Arcs, times: Array) -> Motion:
         x[...] = spread(arcs.x[:, d])
         v[...] = spread(arcs.v[:, d])
         a[...] = spread(arcs.a[:, d])
-        x += s * (v + s * (0.5 * a))  # (1), before v is overwritten
+        x += s * (v + s * (0.5 * a))  # (1), computed before v is overwritten
         v += s * a  # (2)
     x, v, a = np.moveaxis(result, 1, 3)
     return Motion(x, v, a)
 
 
 def _places(times: Array, arcs: Arcs) -> Indices:
-    """(n,) for each arc the first instant of its lane that is not before it begins."""
+    """Return the index (n,) of the first sample of its element that is not before each arc."""
     begins = arcs.t[:, 0]
     if len(times) == 1:
         return np.searchsorted(times[0], begins)
-    # Bisection of all arcs at once: `searchsorted` takes one row of instants, here each lane has
-    # its own.
+    # All arcs are bisected together, because `searchsorted` accepts only one row of times, while
+    # here each element has its own.
     size = times.shape[1]
     low = np.zeros(begins.size, dtype=np.intp)
     high = np.full(begins.size, size, dtype=np.intp)

@@ -1,4 +1,4 @@
-"""Parts of the lanes, and motions of parts put together."""
+"""Select parts of a batch, and join the trajectories of parts."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from sims.system import Lanes, Motion
 
 
 def take(lanes: Lanes, i: Indices) -> Lanes:
-    """Some lanes, i (n,)."""
+    """Return the part of a batch with the elements i (n,)."""
     if i.size == len(lanes.x) and (i[1:] > i[:-1]).all():
         return lanes
-    if lanes.steps.strides[0] == 0:  # shared by all lanes, and shared it stays
+    if lanes.steps.strides[0] == 0:  # steps shared by all elements stay shared
         steps = np.broadcast_to(lanes.steps[0], (i.size, lanes.steps.shape[1]))
     else:
         steps = lanes.steps[i]
@@ -31,7 +31,15 @@ def take(lanes: Lanes, i: Indices) -> Lanes:
 
 
 def joined(parts: list[tuple[Indices, Motion]], lanes: Lanes) -> Motion:
-    """Motions of parts of the lanes put together in the lanes' own order."""
+    """Join the trajectories of parts of a batch, in the order of the batch.
+
+    Args:
+        parts: indices (n,) of the elements of each part, with their trajectories.
+        lanes: whole batch.
+
+    Returns:
+        The trajectories of the whole batch.
+    """
     first, motion = parts[0]
     if len(parts) == 1 and (first == np.arange(len(lanes.x))).all():
         return motion

@@ -1,8 +1,8 @@
-"""Fixed steps of fourth order, with what happens within them: impacts, standstill, breaking loose.
+"""Runge-Kutta 4 steps with events: impacts, standstill and break-away.
 
-The method is the classical one of Runge and Kutta, written for x'' = a(t, x, v) (E. Hairer, S. P.
-Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sections II.1 and, for second
-order, II.14, doi:10.1007/978-3-540-78862-1). With step h,
+The method is the classical Runge-Kutta method of fourth order, written for x'' = a(t, x, v) (E.
+Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sections II.1
+and, for second order, II.14, doi:10.1007/978-3-540-78862-1). With step h,
 
     k1 = a(t, x, v)                                                        (1)
     k2 = a(t + h/2, x + h/2 v, v + h/2 k1)                                 (2)
@@ -11,24 +11,24 @@ order, II.14, doi:10.1007/978-3-540-78862-1). With step h,
     x' = x + h v + h^2/6 (k1 + k2 + k3)                                    (5)
     v' = v + h/6 (k1 + 2 k2 + 2 k3 + k4)                                   (6)
 
-How far the acceleration bends within the step is told by (6) less the midpoint rule, v + h/2 (k2 +
-k3), a second:
+The nonlinearity of the acceleration within the step is estimated by the difference between (6) and
+the midpoint rule, v + h/2 (k2 + k3), per second:
 
     b = (k1 - k2 - k3 + k4) / 6                                            (7)
 
-Steps are those of the plan, divided where a lane's motion is too fast for them. Every lane has its
-own clock: a step in which something happens is taken back and taken again up to that instant,
-estimated by interpolation and corrected to second order by what is then left; the state is changed
-there, and the rest of the step follows. No lane waits for another, nor knows of it. With distance d
-to the event after the second attempt, its rate r and its acceleration a, the event is
+Steps are the planned ones, divided where the motion of an element is too fast for them. Every
+element has its own clock. A step that contains an event is rejected and repeated up to the event
+time, which is estimated by interpolation and corrected to second order afterwards; the state is
+changed there, and the rest of the step follows. No element waits for another or depends on it. With
+distance d to the event after the second attempt, its rate r and its acceleration a, the event is
 
     s = -d / r (1 + d a / (2 r^2))                                         (8)
 
-seconds away, which solves d + r s + a s^2 / 2 = 0 but for terms of third order in d.
+seconds away, which solves d + r s + a s^2 / 2 = 0 up to terms of third order in d.
 
-A lane with dry friction whose velocity would turn round is stopped where it is zero. Steps in which
-friction or the forces of effects bend sharply (Stribeck's peak, the ripples of a fast motor) are
-taken back and shortened.
+An element with dry friction whose velocity would reverse is stopped where the velocity is zero.
+Steps in which friction or the forces of effects are too nonlinear (Stribeck's peak, the ripples of
+a fast motor) are rejected and shortened.
 """
 
 from __future__ import annotations
@@ -44,41 +44,44 @@ from sims.engines.ground import Ground, Indices, Mask
 from sims.system import Lanes, Motion
 
 EVENTS = 256
-"""Events in one step of one lane; what else happens in that step is passed over."""
+"""Maximum number of events in one step of one element; further events are ignored."""
 FRICTION_BEND = 0.05
-"""Share of its largest value so far by which dry friction may bend within a step, eq. (7)."""
+"""Nonlinearity tolerance of dry friction, as a fraction of its largest value so far, eq. (7)."""
 FORCE_BEND = 0.005
-"""Share of the largest acceleration so far by which the acceleration may bend within a step."""
+"""Nonlinearity tolerance of the acceleration, as a fraction of its largest value so far."""
 FAINT = 1e-5
-"""Share of the largest acceleration so far below which friction may bend as it likes."""
+"""Fraction of the largest acceleration so far below which friction is negligible.
+
+Nonlinearity of negligible friction does not shorten a step.
+"""
 SHORTENED = 0.25
-"""A step in which forces bend too much is taken again with this share of its length."""
+"""Reduction factor of the length of a step in which forces are too nonlinear."""
 FINEST = 1.0 / 256.0
-"""Share of a full step below which none is shortened."""
+"""Fraction of a full step below which steps are not shortened."""
 PUNCTUAL = 1e-4
-"""Share of a step by which breaking loose may be late."""
+"""Time tolerance of break-away, as a fraction of a step."""
 STILL = 1e-9
-"""Share of what a full step's acceleration makes of speed below which a stopped lane is at rest."""
+"""Fraction of the speed change in a full step below which a stopped element is at rest."""
 
 NOTHING = 0
-"""A lane's steps lead to no event."""
+"""Goal of a step: no event."""
 IMPACT = 1
-"""A lane's next step ends where it meets the ground."""
+"""Goal of a step that ends with an impact on the ground."""
 STANDSTILL = 2
-"""A lane's next step ends where dry friction has stopped it."""
+"""Goal of a step that ends where dry friction has stopped the element."""
 LOOSE = 3
-"""A lane's next step ends where what pulls exceeds dry friction."""
+"""Goal of a step that ends at break-away, where the pulling force exceeds dry friction."""
 
 
 class Stepping:
-    """Integrates lanes step by step, over `ground` if there is any.
+    """Stepper of a batch, with impacts if there is a ground.
 
     Args:
-        lanes: what to integrate.
-        field: its forces.
-        ground: what it may strike.
-        spans: (L, 1) longest step of each lane, seconds.
-        parts: (L, 1) into how many parts it is to be divided.
+        lanes: batch to integrate.
+        field: forces on the batch.
+        ground: ground contact; None without ground.
+        spans: (L, 1) longest step of each element in seconds.
+        parts: (L, 1) number of parts into which it is divided.
     """
 
     def __init__(
@@ -87,7 +90,7 @@ class Stepping:
         count, dim = lanes.x.shape
         self._field = field
         self._ground = ground
-        # Stored coordinate by coordinate: what is per lane, (L, 1), multiplies whole rows.
+        # Each coordinate is contiguous, so that values of shape (L, 1) multiply whole rows.
         self._state = np.empty((3, dim, count))
         self._rows = self._state.reshape(3 * dim, count)
         self._x, self._v, self._a = (part.T for part in self._state)
@@ -96,31 +99,38 @@ class Stepping:
         shared = lanes.steps.strides[0] == 0
         self._planned = np.count_nonzero(lanes.steps[:1] if shared else lanes.steps, axis=1)
         if lanes.system.bends:
-            # What swings behind the system is stepped as finely as that takes, and waited for.
+            # The fine steps that hidden states need count as planned steps.
             self._planned = self._planned * parts[:, 0]
         self._taken = np.zeros(count)
-        # A hair longer than the part, so that rounding does not leave a crumb behind the last one.
+        # Slightly longer than the part, so that rounding does not leave a tiny step after the last
+        # one.
         self._longest = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
-        # Lanes without any of these take the plan's steps as they are, which is much cheaper.
+        # Elements without any of these take the planned steps unchanged, which is much faster.
         self._bends = field.dry or bool(field.pushed.any())
         self._eventful = ground is not None or self._bends or bool((parts > 1).any())
         self._clock = Clock(lanes)
         self._dynamics = Dynamics(field, (count, dim))
-        self._limit = self._longest  # of steps, as forces bend
+        self._limit = self._longest  # of step sizes, from nonlinearity
         self._peak = np.zeros((count, 1))  # square of the largest acceleration so far
         self._rubbed = np.zeros((count, 1))  # largest friction so far
         self._try = np.full((count, 1), np.inf)  # seconds to an event
         self._goal = np.full(count, NOTHING, dtype=np.int8)
         self._events = np.zeros(count, dtype=np.intp)
-        # Open to events: under way to none, and not after too many.
+        # An element is open to events if none is pending and it has not had too many in this step.
         self._open = np.ones(count, dtype=bool)
         self._awaits = self._shortened = False
         if ground is not None:
             self._start_on(ground)
 
     def run(self, patience: float = np.inf) -> Motion:
-        """All steps; a lane that needs more than `patience` times the planned ones is NaN from
-        there on.
+        """Integrate all steps.
+
+        Args:
+            patience: maximum number of steps of an element, as a multiple of the planned ones;
+                beyond it, the element is NaN.
+
+        Returns:
+            The trajectories.
         """
         clock = self._clock
         dynamics = self._dynamics
@@ -129,13 +139,13 @@ class Stepping:
             self._field.feel(clock.inputs())
             k1 = dynamics.begin(clock.t, self._x, self._v)  # (1)
             self._a[...] = k1
-            # Kept before the step and not after it: k1 is the acceleration that belongs to it.
+            # Recorded before the step, because k1 is the acceleration of this state.
             clock.keep(self._rows)
             if clock.over or (hurries and self._overdue(patience)):
                 return clock.motion()
             if self._eventful:
                 h = np.minimum(clock.left, self._limit)
-                # A step that an event has cut short is taken again just up to that event.
+                # A step with an event is repeated only up to that event.
                 if self._awaits:
                     h = np.minimum(h, self._try)
                 self._settle(h, k1)
@@ -144,15 +154,17 @@ class Stepping:
                 clock.finish()
 
     def _overdue(self, patience: float) -> bool:
-        """Count a step of every lane on its way, and give up those with too many; whether none is
-        left.
+        """Count a step of every active element and abandon those with too many steps.
+
+        Returns:
+            Whether no active element remains.
         """
         self._taken += self._clock.left[:, 0] > 0
         late = self._taken > patience * self._planned
         if not late.any():
             return False
         self._rows[:, late] = np.nan
-        # Whatever a lost lane was waiting for must not hold up the clock of the others.
+        # A pending event of an abandoned element must not delay the clock of the others.
         self._limit = np.where(late[:, None], self._longest, self._limit)
         self._try[late] = np.inf
         self._goal[late] = NOTHING
@@ -161,8 +173,15 @@ class Stepping:
         return bool(self._clock.over)
 
     def _stepped(self, h: Array, k1: Array) -> tuple[Array, Array, Array, Array]:
-        """Position, velocity and (to third order) acceleration a step of h (L, 1) later; how the
-        acceleration bent.
+        """Compute one step of h (L, 1) seconds.
+
+        Args:
+            h: (L, 1) step sizes in seconds.
+            k1: (L, D) accelerations at the beginning.
+
+        Returns:
+            Position, velocity and (to third order) acceleration after the step, and six times the
+            nonlinearity (7).
         """
         t = self._clock.t
         x = self._x
@@ -183,9 +202,9 @@ class Stepping:
         return after_x, after_v, k4, outer - inner  # six times (7)
 
     def _settle(self, h: Array, k1: Array) -> None:
-        """Make steps of h (L, 1) where nothing happens in them; prepare to repeat the others."""
+        """Accept steps of h (L, 1) without events; prepare to repeat the others."""
         x, v, k4, bend = self._stepped(h, k1)
-        # Bends first: events are looked for in steps that are worth believing.
+        # Nonlinearity is checked first: events are searched only in accurate steps.
         refused = self._bent(h, k1, bend) if self._bends else None
         now = self._x, self._v, k1
         then = x, v, k4
@@ -198,7 +217,7 @@ class Stepping:
         else:
             np.copyto(self._x, x, where=~refused[:, None])
             np.copyto(self._v, v, where=~refused[:, None])
-            h = np.where(refused[:, None], 0.0, h)  # no time has passed where no step was made
+            h = np.where(refused[:, None], 0.0, h)  # time does not advance for rejected steps
         self._clock.spend(h)
         if self._awaits:
             self._reach(refused, k4)
@@ -210,18 +229,25 @@ class Stepping:
             self._open = (self._goal == NOTHING) & (self._events < EVENTS)
 
     def _bent(self, h: Array, k1: Array, bend: Array) -> Mask | None:
-        """(L,) lanes whose step must be shorter, as forces bend too much in it; None if there are
-        none.
+        """Return the elements (L,) whose step must be shorter, as forces are too nonlinear in it.
+
+        Args:
+            h: (L, 1) step sizes in seconds.
+            k1: (L, D) accelerations at the beginning.
+            bend: (L, D) six times the nonlinearity (7).
+
+        Returns:
+            Elements (L,) to repeat with a shorter step; None if there are none.
         """
         field = self._field
-        # Squares are compared, which saves a root for each lane; `bend` is six times (7).
+        # Squares are compared, which avoids a root for each element; `bend` is six times (7).
         self._peak = np.maximum(self._peak, dot(k1, k1))
         most_bent = (6.0 * FORCE_BEND) ** 2 * self._peak
         sharp = field.pushed & (dot(bend, bend) > most_bent)
         if field.dry:
-            first, second, third, fourth = self._dynamics.rubs  # at the instants of (1) to (4)
-            # Against the largest so far: a Stribeck peak's tail, all but nothing at speed, bends
-            # sharply in proportion.
+            first, second, third, fourth = self._dynamics.rubs  # at the stages (1) to (4)
+            # The nonlinearity is compared with the largest friction so far: the tail of a Stribeck
+            # peak, almost zero at speed, is strongly nonlinear in relation to itself.
             rubbed = np.maximum(length(first), length(fourth))
             self._rubbed = np.maximum(self._rubbed, rubbed)
             faint = FAINT * np.sqrt(self._peak) * field.mass
@@ -231,10 +257,11 @@ class Stepping:
             sharp |= bends & field.rubs & ~self._dynamics.sticks
         any_sharp = sharp.any()
         if any_sharp:
-            # A step that leads to an event keeps its length, or the event would not be met.
+            # A step that leads to an event keeps its length, otherwise the event would be missed.
             sharp &= (h > FINEST * self._longest) & self._open[:, None]
         if any_sharp or self._shortened:
-            # The limit doubles with each step that is made at it: what bent may still be near.
+            # The limit doubles with each accepted step of that length, as the nonlinearity may
+            # still be near.
             grown = np.where(h >= self._limit, 2.0 * self._limit, self._limit)
             grown = np.minimum(grown, self._longest)
             self._limit = np.where(sharp, SHORTENED * h, grown)
@@ -248,14 +275,16 @@ class Stepping:
         then: tuple[Array, Array, Array],
         refused: Mask | None,
     ) -> Mask | None:
-        """(L,) lanes to which something happens within the step, with the seconds to it set; None
-        if there are none.
+        """Return the elements (L,) with an event within the step, and schedule these events.
 
         Args:
-            h: (L, 1) the step.
-            now: position, velocity and acceleration before it.
-            then: the same after it.
-            refused: (L,) lanes whose step is not made anyway.
+            h: (L, 1) step sizes in seconds.
+            now: position, velocity and acceleration before the step.
+            then: position, velocity and acceleration after the step.
+            refused: (L,) elements whose step is already rejected.
+
+        Returns:
+            Elements (L,) with an event; None if there are none.
         """
         watched = self._open if refused is None else self._open & ~refused
         result = None
@@ -273,8 +302,8 @@ class Stepping:
                 seconds = self._standstills(np.flatnonzero(turned), h, now, then)
                 self._await(turned, h, seconds, STANDSTILL)
                 result = turned if result is None else result | turned
-            # A lane on its way to breaking loose is asked again, a little late being good enough:
-            # the excess bends within the step, and its root is that of a straight line.
+            # An element with scheduled break-away is checked again with a tolerance: the excess is
+            # nonlinear within the step, and its root is that of a straight line.
             before, after = dynamics.excess
             to_loose = self._goal == LOOSE
             late = np.where(to_loose, PUNCTUAL, 0.0)[:, None] * (after - before)
@@ -288,7 +317,7 @@ class Stepping:
     def _impacts(
         self, i: Indices, h: Array, now: tuple[Array, ...], then: tuple[Array, ...]
     ) -> Array:
-        """(n,) seconds to the impacts of lanes i (n,)."""
+        """Return the seconds (n,) to the impacts of elements i (n,)."""
         assert self._ground is not None
         floor = self._ground.floor[i, 0]
         height = now[0][i, -1] - floor
@@ -299,7 +328,7 @@ class Stepping:
     def _standstills(
         self, i: Indices, h: Array, now: tuple[Array, ...], then: tuple[Array, ...]
     ) -> Array:
-        """(n,) seconds until lanes i (n,) have lost their speed along their way."""
+        """Return the seconds (n,) until elements i (n,) lose their speed along their direction."""
         way = self._dynamics.way[i]
         speed = dot(now[1][i], way)[:, 0]
         rate = dot(now[2][i], way)[:, 0]
@@ -307,17 +336,23 @@ class Stepping:
         return root(speed, rate, later, h[i, 0])
 
     def _loosenings(self, i: Indices, h: Array) -> Array:
-        """(n,) seconds until what pulls lanes i (n,) exceeds friction, and hardly longer, so that
-        it surely does.
+        """Return the seconds (n,) until the forces on elements i (n,) exceed dry friction.
+
+        The time is slightly later, so that the force certainly exceeds it.
         """
         before, after = (excess[i, 0] for excess in self._dynamics.excess)
-        # The root of the straight line, and a tenth of the tolerance beyond it.
+        # Root of the straight line, plus a tenth of the tolerance.
         result: Array = h[i, 0] * (before / (before - after) + 0.1 * PUNCTUAL)
         return result
 
     def _await(self, lanes: Mask, h: Array, seconds: Array, goal: int) -> None:
-        """Note to what and when the next steps of `lanes` (L,) lead; of two events the first
-        counts.
+        """Schedule an event at the end of the next steps; of two events the first counts.
+
+        Args:
+            lanes: (L,) elements with the event.
+            h: (L, 1) step sizes in seconds.
+            seconds: (n,) seconds to the event.
+            goal: kind of event.
         """
         i = np.flatnonzero(lanes)
         first = seconds < self._try[i, 0]
@@ -330,13 +365,13 @@ class Stepping:
         self._awaits = True
 
     def _reach(self, refused: Mask | None, k4: Array) -> None:
-        """Let happen to the lanes that have made a step what it led to."""
+        """Apply the scheduled events of the elements whose step was accepted."""
         there = np.isfinite(self._try[:, 0])
         if refused is not None:
             there &= ~refused
         if not there.any():
             return
-        # Breaking loose needs nothing done: the next `begin` finds that the lane slips.
+        # Break-away needs no action: the next `begin` finds that the element slips.
         struck = np.flatnonzero(there & (self._goal == IMPACT))
         stopped = np.flatnonzero(there & (self._goal == STANDSTILL))
         if struck.size:
@@ -348,7 +383,12 @@ class Stepping:
         self._awaits = bool(np.isfinite(self._try).any())
 
     def _strike(self, i: Indices, a: Array) -> None:
-        """Impacts of lanes i (n,), to which their steps led but for rounding; a (n, D) before."""
+        """Apply impacts to elements i (n,) whose steps end there up to rounding.
+
+        Args:
+            i: (n,) indices of the elements.
+            a: (n, D) accelerations before the impact.
+        """
         assert self._ground is not None
         x = self._x[i]
         v = self._v[i]
@@ -361,7 +401,8 @@ class Stepping:
         x = x + late * (v + 0.5 * late * a)
         v = v + late * a
         self._clock.correct(i, late)
-        # On the ground to the last bit and not moving up, or the next step would strike it again.
+        # Exactly on the ground and not moving up, otherwise the next step would contain the same
+        # impact.
         x[:, -1:] = floor
         v[:, -1:] = np.minimum(v[:, -1:], 0.0)
         outcome = self._ground.strike(i, v, a)
@@ -371,15 +412,21 @@ class Stepping:
             self._dynamics.lay(i[outcome.rests])
 
     def _rounding(self, i: Indices, seconds: Array) -> Array:
-        """Corrections (n, 1) of lanes i (n,), none longer than a step: of a lane all but at rest
-        they mean nothing.
+        """Return time corrections (n, 1) of elements i (n,), limited to one step.
+
+        For an element that is almost at rest, the unlimited correction is meaningless.
         """
         step = self._longest[i]
         bounded: Array = np.clip(np.nan_to_num(seconds), -step, step)
         return bounded
 
     def _stop(self, i: Indices, a: Array) -> None:
-        """Lanes i (n,) have lost their speed along their way but for rounding; a (n, D) before."""
+        """Stop elements i (n,) that have lost their speed along their direction, up to rounding.
+
+        Args:
+            i: (n,) indices of the elements.
+            a: (n, D) accelerations before.
+        """
         v = self._v[i]
         way = self._dynamics.way[i]
         slows = dot(a, way)
@@ -389,13 +436,15 @@ class Stepping:
         self._clock.correct(i, late)
         v = v + late * a
         v = v - way * dot(v, way)
-        # Exactly zero, not nearly: only a lane of no speed at all can stick.
+        # The speed becomes exactly zero, because only an element with zero speed can stick.
         faint = STILL * self._dynamics.size(a) * self._longest[i]
         self._v[i] = self._dynamics.halted(v, faint)
 
     def _start_on(self, ground: Ground) -> None:
-        """Lift lanes that start in the ground onto it; throw back or lay to rest those that do not
-        move up.
+        """Apply ground contact at the initial state.
+
+        Elements that start inside the ground are moved to its surface; those that do not move up
+        have an impact or rest.
         """
         self._x[:, -1:] = np.maximum(self._x[:, -1:], ground.floor)
         height = self._x[:, -1]
@@ -403,7 +452,8 @@ class Stepping:
         down = (height <= ground.floor[:, 0]) & (rate <= 0)
         if down.any():
             a = self._dynamics.begin(self._clock.t, self._x, self._v)
-            # Told apart before the impacts, after which a struck lane may have no speed either.
+            # Both groups are determined before the impacts, after which a struck element may have
+            # zero speed.
             struck = np.flatnonzero(down & (rate < 0))
             lying = np.flatnonzero(down & (rate == 0))
             if struck.size:

@@ -1,8 +1,8 @@
-"""Steps the lanes of one program, a block of them side by side, each by its own clock.
+"""Step the elements of one program, a block of them together, each with its own clock.
 
-The method and its equations are those of `sims.engines.batch.stepping`. A lane that is done gives
-its slot to the next, so slots stay in use whatever the lanes need; what a lane does depends on no
-other.
+The method and its equations are those of `sims.engines.batch.stepping`. The slot of a finished
+element is given to the next one, so that slots stay in use although elements need different numbers
+of steps. The result of an element does not depend on any other.
 """
 
 from __future__ import annotations
@@ -74,7 +74,14 @@ from sims.engines.compiled.kinds import (
 
 
 def advance(program: Program, work: Work, block: Block, w: int) -> None:
-    """All steps of all lanes, in w slots."""
+    """Make all steps of all elements.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
+    """
     begun = 0
     alive = 0
     for i in range(w):
@@ -84,7 +91,7 @@ def advance(program: Program, work: Work, block: Block, w: int) -> None:
             begun += 1
             alive += 1
         else:
-            load(program, work, block, i, work.order.size - 1)  # of which nothing is read
+            load(program, work, block, i, work.order.size - 1)  # its result is not used
             block.n[PLACE, i] = -1
     fresh = True
     while alive > 0:
@@ -119,8 +126,16 @@ def advance(program: Program, work: Work, block: Block, w: int) -> None:
 
 
 def start_on(program: Program, work: Work, block: Block, w: int) -> None:
-    """Lift lanes that start in the ground onto it; throw back or lay to rest those that do not move
-    up.
+    """Apply ground contact at the initial state of newly loaded elements.
+
+    Elements that start inside the ground are moved to its surface; those that do not move up have
+    an impact or rest.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
     """
     a = block.a
     n = block.n
@@ -147,13 +162,21 @@ def start_on(program: Program, work: Work, block: Block, w: int) -> None:
 
 
 def is_new(block: Block, i: int) -> bool:
-    """Whether a lane was just put into the slot."""
+    """Return whether an element has just been loaded into slot `i`."""
     n = block.n
     return bool(n[PLACE, i] >= 0 and n[STEP, i] == 0 and n[BEGINS, i] == 1)
 
 
 def attempt(program: Program, block: Block, w: int) -> None:
-    """A step of H seconds of every lane, into rows NEXT_X and NEXT_V; (2) to (6)."""
+    """Try a step of H seconds of every element, equations (2) to (6).
+
+    The result is stored in rows NEXT_X and NEXT_V.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+    """
     a = block.a
     r = block.r
     d = program.flags[DIMENSIONS]
@@ -191,7 +214,13 @@ def attempt(program: Program, block: Block, w: int) -> None:
 
 
 def look(program: Program, block: Block, w: int) -> None:
-    """Tell the lanes to which something may have happened in the step just tried: they are busy."""
+    """Mark the elements as busy that may have an event in the step just tried.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+    """
     a = block.a
     n = block.n
     d = program.flags[DIMENSIONS]
@@ -221,7 +250,15 @@ def look(program: Program, block: Block, w: int) -> None:
 
 
 def look_at_friction(program: Program, block: Block, w: int) -> None:
-    """Of lanes with dry friction; in several dimensions all are busy."""
+    """Mark the elements as busy that may have a friction event in the step just tried.
+
+    In several dimensions all elements are busy.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+    """
     a = block.a
     n = block.n
     if program.flags[DIMENSIONS] > 1:
@@ -241,7 +278,14 @@ def look_at_friction(program: Program, block: Block, w: int) -> None:
 
 
 def make(program: Program, work: Work, block: Block, w: int) -> None:
-    """Make the steps just tried of lanes that are not busy."""
+    """Accept the steps just tried of elements that are not busy.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
+    """
     a = block.a
     n = block.n
     for k in range(program.flags[DIMENSIONS]):
@@ -256,9 +300,11 @@ def make(program: Program, work: Work, block: Block, w: int) -> None:
         grown = 2.0 * a[LIMIT, i]
         grown = grown if grown < a[LONGEST, i] else a[LONGEST, i]
         a[T, i] += h
-        # Steps add up to a little more than what was left; a rest below zero would run backwards.
+        # By rounding, parts of a step may add up to more than its length; a negative rest would run
+        # backwards in time.
         a[LEFT, i] = left if left > 0.0 else 0.0
-        # The limit doubles with each step that is made at it: what bent may still be near.
+        # The limit doubles with each accepted step of that length, as the nonlinearity may still be
+        # near.
         a[LIMIT, i] = grown if n[BUSY, i] == 0 and h >= a[LIMIT, i] else a[LIMIT, i]
     for i in range(w):
         if a[LEFT, i] <= 0.0 and n[BUSY, i] == 0:
@@ -266,7 +312,14 @@ def make(program: Program, work: Work, block: Block, w: int) -> None:
 
 
 def settle(program: Program, work: Work, block: Block, i: int) -> None:
-    """Make the step just tried if nothing happens in it; else prepare to repeat it."""
+    """Accept the step just tried if it contains no event, otherwise prepare to repeat it.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        i: index of the slot.
+    """
     a = block.a
     n = block.n
     d = program.flags[DIMENSIONS]
@@ -282,7 +335,8 @@ def settle(program: Program, work: Work, block: Block, i: int) -> None:
         a[V + k, i] = a[NEXT_V + k, i]
     h = a[H, i]
     a[T, i] += h
-    # Steps add up to a little more than what was left; a rest below zero would run backwards.
+    # By rounding, parts of a step may add up to more than its length; a negative rest would run
+    # backwards in time.
     a[LEFT, i] = larger(a[LEFT, i] - h, 0.0)
     if n[GOAL, i] != NOTHING:
         reach(program, work, block, i)

@@ -1,7 +1,7 @@
-"""Compiles the functions that step lanes into one piece of machine code.
+"""Compile the functions that step elements into one piece of machine code.
 
-In a process of its own (`main`): numba is then asked in the same way whatever the user asks of it,
-and what it takes of memory is given back.
+The compilation runs in a separate process (`main`). There, numba ignores the user's settings, and
+its memory is released afterwards.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MODULES: tuple[ModuleType, ...] = (
     lockstep,
     pace,
 )
-"""Where the functions are."""
+"""Modules that contain the compiled functions."""
 _WRITTEN_OUT = frozenset(
     {
         *("present", "begin", "during", "pulled", "free", "attempt", "make", "go_on", "feel"),
@@ -46,18 +46,19 @@ _WRITTEN_OUT = frozenset(
         *("dot", "length", "begin_on_a_line", "during_on_a_line"),
     }
 )
-"""Functions that are written out where they are used: a call hands over more than they do."""
+"""Functions that are inlined, because a call costs more than their body."""
 _START = "import sys; sys.path[:] = {path!r}; from sims.engines.compiled.build import main; main()"
 
 
 def built() -> bytes:
-    """The machine's code, packed.
+    """Return the packed machine code of the kernel.
 
     Raises:
-        native.UnusableError: it cannot be made; the message is the last that the compiler said.
+        native.UnusableError: the compilation failed; the message is the last line of the compiler's
+            output.
     """
     environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
-    # All of it is optimised at once, at the end, and not each function with all that it calls.
+    # Everything is optimised once at the end, instead of each function with all its callees.
     environment["NUMBA_OPT"] = "0"
     done = subprocess.run(
         [sys.executable, "-c", _START.format(path=sys.path)],
@@ -73,15 +74,15 @@ def built() -> bytes:
 
 
 def main() -> None:
-    """Write the code to where `built` reads it."""
+    """Write the code to the standard output, where `built` reads it."""
     sys.stdout.buffer.write(native.made(*translated()).packed())
 
 
 def translated() -> tuple[str, str]:
-    """The machine's intermediate code and the name of the function in it."""
+    """Return the LLVM intermediate code of the kernel and the name of its function."""
     import numba as typed
 
-    # Half of it has types, and says of the other half that it has none.
+    # numba is only partly typed, and its untyped functions would fail the type check.
     numba: Any = typed
     types = numba.types
     space: dict[str, Any] = {}
@@ -100,13 +101,13 @@ def translated() -> tuple[str, str]:
         made = numba.njit(
             forceinline=name in _WRITTEN_OUT,
             error_model="numpy",
-            # Without counted references: an atomic count for each array looked at takes ten times
-            # as long as the numbers. And without what Python would call it by.
+            # Without reference counting: an atomic counter for each used array takes ten times as
+            # long as the computation. Wrappers for calls from Python are not needed.
             _nrt=False,
             no_cpython_wrapper=True,
             no_cfunc_wrapper=True,
         )(FunctionType(functions[name].__code__, space, name))
-        # Once, and not anew for every constant that it is called with.
+        # Compiled once, instead of again for each constant argument.
         made.compile(tuple(arguments[p.annotation] for p in given))
         made.disable_compile()
         space[name] = made
@@ -120,7 +121,7 @@ def translated() -> tuple[str, str]:
 
 
 def _arguments(numba: Any) -> dict[str, Any]:
-    """The compiler's types, by how arguments are annotated."""
+    """Return the compiler's types by the names of the annotations."""
     whole, whole_table = (np.zeros((1,) * k, dtype=np.int64) for k in (1, 2))
     row, table, box = (np.zeros((1,) * k) for k in (1, 2, 3))
     alike = {

@@ -1,4 +1,4 @@
-"""A lane's run in its slot: which step it is in, what it feels there, which states are kept."""
+"""Time, inputs and recorded states of a batch element in its slot of a block."""
 
 from __future__ import annotations
 
@@ -36,7 +36,15 @@ from sims.engines.compiled.kinds import (
 
 
 def load(program: Program, work: Work, block: Block, i: int, place: int) -> None:
-    """Put a lane into a slot, at the beginning of its run."""
+    """Load an element into a slot, at the beginning of its run.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        i: index of the slot.
+        place: index of the element in `work.order`.
+    """
     a = block.a
     n = block.n
     d = program.flags[DIMENSIONS]
@@ -64,7 +72,14 @@ def load(program: Program, work: Work, block: Block, i: int, place: int) -> None
 
 
 def feel(program: Program, work: Work, block: Block, i: int) -> None:
-    """Set the inputs of the lane's step; behind the last step, the last."""
+    """Set the inputs of the element's step; after the last step, those of the last step.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        i: index of the slot.
+    """
     first = program.rows[IN_U]
     step = min(block.n[STEP, i], work.steps.shape[1] - 1)
     row = block.n[LANE, i] if work.inputs.shape[1] > 1 else 0
@@ -73,7 +88,17 @@ def feel(program: Program, work: Work, block: Block, i: int) -> None:
 
 
 def stays(program: Program, work: Work, block: Block, i: int) -> bool:
-    """Keep the state of a lane that begins a step behind a sample; whether it has more to do."""
+    """Record the state of an element that begins a step at a sample time.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        i: index of the slot.
+
+    Returns:
+        Whether the element has further steps.
+    """
     a = block.a
     n = block.n
     step = n[STEP, i]
@@ -86,14 +111,22 @@ def stays(program: Program, work: Work, block: Block, i: int) -> bool:
     if work.patience < np.inf and a[LEFT, i] > 0.0:
         a[TAKEN, i] += 1.0
         if a[TAKEN, i] > work.patience * work.planned[n[LANE, i]]:
-            # Lost lanes are told by the last state that was kept.
+            # Failed elements are recognised by their last recorded state.
             work.kept[n[LANE, i], work.kept.shape[1] - 1, :] = np.nan
             return False
     return True
 
 
 def keep(program: Program, work: Work, block: Block, i: int, record: int) -> None:
-    """Keep the lane's state."""
+    """Record the element's state.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        i: index of the slot.
+        record: index of the record.
+    """
     a = block.a
     d = program.flags[DIMENSIONS]
     lane = block.n[LANE, i]
@@ -104,7 +137,14 @@ def keep(program: Program, work: Work, block: Block, i: int, record: int) -> Non
 
 
 def go_on(program: Program, work: Work, block: Block, i: int) -> None:
-    """The lane's next step."""
+    """Advance the element to its next planned step.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        i: index of the slot.
+    """
     a = block.a
     n = block.n
     row = n[LANE, i] if work.steps.shape[0] > 1 else 0

@@ -1,6 +1,6 @@
-"""Accelerations of the lanes in a block, with dry friction, and what rests on the ground.
+"""Accelerations of the elements in a block, with dry friction and ground support.
 
-The rules and the numbers of equations are those of `sims.engines.batch.dynamics`.
+The rules and the equation numbers are those of `sims.engines.batch.dynamics`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,13 @@ from sims.engines.compiled.kinds import (
 
 
 def present(program: Program, block: Block, w: int) -> None:
-    """Let the registers show every lane's state, and compute forces there."""
+    """Copy every element's state to the registers and evaluate the forces.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+    """
     d = program.flags[DIMENSIONS]
     rows = program.rows
     r = block.r
@@ -50,7 +56,15 @@ def present(program: Program, block: Block, w: int) -> None:
 
 
 def begin(program: Program, block: Block, w: int) -> None:
-    """Accelerations at the beginning of a step: what sticks, and which way the rest moves."""
+    """Compute the accelerations at the beginning of a step, in rows K1.
+
+    This also determines which elements stick, and the direction of motion of the others.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+    """
     d = program.flags[DIMENSIONS]
     if program.flags[DRY] == 0:
         free(program, block, w, K1)
@@ -72,7 +86,7 @@ def begin(program: Program, block: Block, w: int) -> None:
         still = speed == 0.0
         sticks = still and size <= limit  # (2)
         block.n[STICKS, i] = sticks
-        # (1) and (3): along the motion, or where there is none along what pulls.
+        # (1) and (3): along the motion, or at rest along the pulling force.
         divisor = speed
         if still:
             divisor = size if size > 0.0 else 1.0
@@ -87,7 +101,13 @@ def begin(program: Program, block: Block, w: int) -> None:
 
 
 def begin_on_a_line(program: Program, block: Block, w: int) -> None:
-    """`begin` for one coordinate and no ground: the same numbers, without branches."""
+    """Compute `begin` for one coordinate without ground: the same numbers, without branches.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+    """
     a = block.a
     r = block.r
     limits = program.rows[OUT_LIMIT]
@@ -114,7 +134,15 @@ def begin_on_a_line(program: Program, block: Block, w: int) -> None:
 
 
 def during(program: Program, block: Block, w: int, to: int, rub_to: int) -> None:
-    """Accelerations, into rows `to`, within the step that was begun last."""
+    """Compute the accelerations within the present step.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+        to: first row of the accelerations.
+        rub_to: first row of dry friction.
+    """
     execute(program.code, program.ends[1], program.ends[2], block.r, w)
     if program.flags[DRY] == 0:
         free(program, block, w, to)
@@ -127,7 +155,15 @@ def during(program: Program, block: Block, w: int, to: int, rub_to: int) -> None
 
 
 def during_on_a_line(program: Program, block: Block, w: int, to: int, rub_to: int) -> None:
-    """`during` for one coordinate and no ground."""
+    """Compute `during` for one coordinate without ground.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+        to: row of the acceleration.
+        rub_to: row of dry friction.
+    """
     a = block.a
     r = block.r
     limits = program.rows[OUT_LIMIT]
@@ -143,15 +179,23 @@ def during_on_a_line(program: Program, block: Block, w: int, to: int, rub_to: in
 
 
 def in_space(program: Program, block: Block, i: int, to: int, rub_to: int) -> None:
-    """`during` for a lane of several coordinates."""
+    """Compute `during` for an element of several coordinates.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        i: index of the slot.
+        to: first row of the accelerations.
+        rub_to: first row of dry friction.
+    """
     a = block.a
     guided = program.flags[GUIDED]
     velocity = program.rows[IN_V]
     limit = block.r[program.rows[OUT_LIMIT], i]
     pulled(program, block, i, to)
     a[AFTER, i] = length(a, to, guided, i) - limit
-    # The direction may turn within the step, but not over to the other side: that is a reversal,
-    # which the step is cut for.
+    # The direction may turn within the step, but must not reverse: a reversal is an event at which
+    # the step is cut.
     square = 0.0
     for k in range(guided):
         square += block.r[velocity + k, i] * block.r[velocity + k, i]
@@ -172,7 +216,15 @@ def in_space(program: Program, block: Block, i: int, to: int, rub_to: int) -> No
 
 
 def unguided(program: Program, block: Block, i: int, to: int, rub_to: int) -> None:
-    """Accelerations of the coordinates that dry friction does not act on, from the forces."""
+    """Convert forces to accelerations for the coordinates without dry friction.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        i: index of the slot.
+        to: first row of the accelerations, which contains the forces before.
+        rub_to: first row of dry friction.
+    """
     a = block.a
     for k in range(program.flags[GUIDED], program.flags[DIMENSIONS]):
         a[WAY + k, i] = 0.0
@@ -181,18 +233,32 @@ def unguided(program: Program, block: Block, i: int, to: int, rub_to: int) -> No
 
 
 def pulled(program: Program, block: Block, i: int, to: int) -> None:
-    """Forces but for dry friction, without what the ground takes."""
+    """Compute all forces except dry friction, without the part that the ground supports.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        i: index of the slot.
+        to: first row of the forces.
+    """
     d = program.flags[DIMENSIONS]
     for k in range(d):
         block.a[to + k, i] = block.r[program.out[k], i]
     if block.n[RESTS, i] != 0:
-        # The ground pushes and does not pull: what lifts the lane is left to it.
+        # The ground pushes but does not pull: an upward force remains.
         up = to + d - 1
         block.a[up, i] = larger(block.a[up, i], 0.0)
 
 
 def free(program: Program, block: Block, w: int, to: int) -> None:
-    """Accelerations without dry friction, into rows `to`."""
+    """Compute accelerations without dry friction, in rows `to`.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+        to: first row of the accelerations.
+    """
     a = block.a
     d = program.flags[DIMENSIONS]
     for k in range(d):

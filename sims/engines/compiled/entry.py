@@ -1,4 +1,4 @@
-"""The one function that is called from outside: pointers in, lanes stepped."""
+"""Exported function of the kernel: it receives pointers and steps the elements."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from sims.engines.compiled.pace import divide
 if TYPE_CHECKING:
 
     def carray(pointer: Any, shape: Any) -> Any:
-        """The array at a pointer; the compiler's own."""
+        """Return the array at a pointer; the compiler's own function."""
 
 
 SIZES = 13
-"""Whole numbers that come first: what they are, `integrate` says."""
+"""Number of integers in the first argument of `integrate`."""
 ARRAYS = 22
-"""Pointers behind them."""
+"""Number of array pointers of `integrate`, including that of the two floating-point numbers."""
 
 
 def integrate(
@@ -47,7 +47,10 @@ def integrate(
     spans_at: Any,
     parts_at: Any,
 ) -> None:
-    """`divide`, `advance`, `march` or `execute`, with arrays by their addresses."""
+    """Run `divide`, `advance`, `march` or `execute` with arrays given by their addresses.
+
+    The first integer selects the function: 0, 1, 2 or 3.
+    """
     sizes = carray(sizes_at, (SIZES,))
     if sizes[0] == 3:
         code, r = carray(code_at, (sizes[4], 5)), carray(r_at, (sizes[11], sizes[12]))

@@ -1,9 +1,10 @@
-"""Runs a program over the slots of a block: each instruction is one loop over lanes.
+"""Vector interpreter of force programs: each instruction is one loop over the slots of a block.
 
-Plain Python that a compiler takes as it stands (`sims.engines.compiled.build`); uncompiled it does
-the same, slowly. A register is a row, a slot a column. Sine, cosine and exponential are computed
-the same way for every lane, by the reductions and with the coefficients of fdlibm (Sun
-Microsystems, 1993): x = k pi/2 + r with |r| <= pi/4, and x = k ln 2 + r with |r| <= ln 2 / 2,
+The code is plain Python that the compiler accepts unchanged (`sims.engines.compiled.build`);
+without compilation it gives the same results, but slowly. A register is a row, a slot a column.
+Sine, cosine and exponential are computed in the same way for every element, with the argument
+reductions and coefficients of fdlibm (Sun Microsystems, 1993): x = k pi/2 + r with |r| <= pi/4, and
+x = k ln 2 + r with |r| <= ln 2 / 2,
 
     sin r = r + r^3 (S1 + ...),    cos r = 1 - r^2/2 + r^4 (C1 + ...)      (1)
     exp r = 1 + r + r c / (2 - c),    c = r - r^2 (P1 + ...)               (2)
@@ -17,27 +18,27 @@ from sims.engines.compiled.graph import CODES
 from sims.engines.compiled.kinds import Numbers, Table
 
 ROUNDER = 6755399441055744.0
-"""Added and taken away, it leaves the nearest whole number: 1.5 * 2^52."""
+"""Number whose addition and subtraction rounds to the nearest integer: 1.5 * 2^52."""
 TURNS = 2.0 / np.pi
 QUARTER_1 = 1.57079632673412561417e00
-"""The first 33 bits of pi/2; multiples up to 2^20 are exact."""
+"""First 33 bits of pi/2; multiples up to 2^20 are exact."""
 QUARTER_2 = 6.07710050630396597660e-11
-"""The next 33 bits."""
+"""Second 33 bits of pi/2."""
 QUARTER_3 = 2.02226624879595063154e-21
-"""What is left of it."""
+"""Remainder of pi/2 after the first 66 bits."""
 FAR = 1e5
-"""Beyond this many radians the library's own sine is asked."""
+"""Largest angle in radians for the reduction; beyond it the library's sine is used."""
 
 DOUBLINGS = 1.44269504088896338700e00
-"""1 / ln 2."""
+"""Inverse of ln 2."""
 DOUBLING_1 = 6.93147180369123816490e-01
-"""The first 32 bits of ln 2."""
+"""First 32 bits of ln 2."""
 DOUBLING_2 = 1.90821492927058770002e-10
-"""What is left of it."""
+"""Remainder of ln 2 after the first 32 bits."""
 STEEP = 700.0
-"""Beyond it the library's own exponential is asked."""
+"""Largest argument of the exponential; beyond it the library's exponential is used."""
 EXPONENT = ROUNDER + 1023.0
-"""Added to a whole number k, it has the exponent of 2^k in its last bits."""
+"""Number whose sum with an integer k has the exponent of 2^k in its last bits."""
 
 ADD = CODES["add"]
 SUBTRACT = CODES["subtract"]
@@ -80,17 +81,25 @@ COPYSIGN = CODES["copysign"]
 
 
 def larger(a: float, b: float) -> float:
-    """numpy.maximum: what is no number stays."""
+    """Return the maximum as `numpy.maximum`: NaN if an argument is NaN."""
     return a if a >= b or a != a else b
 
 
 def smaller(a: float, b: float) -> float:
-    """numpy.minimum: what is no number stays."""
+    """Return the minimum as `numpy.minimum`: NaN if an argument is NaN."""
     return a if a <= b or a != a else b
 
 
 def turn(r: Numbers, o: int, a: int, w: int, ahead: float) -> None:
-    """Row o = sin(row a + `ahead` quarter turns)."""
+    """Compute row o = sin(row a + `ahead` quarter turns).
+
+    Args:
+        r: registers.
+        o: row of the result.
+        a: row of the argument in radians.
+        w: number of slots in use.
+        ahead: number of quarter turns: 0 for sine, 1 for cosine.
+    """
     far = False
     for i in range(w):
         x = r[a, i]
@@ -120,7 +129,14 @@ def turn(r: Numbers, o: int, a: int, w: int, ahead: float) -> None:
 
 
 def grow(r: Numbers, o: int, a: int, w: int) -> None:
-    """Row o = exp(row a)."""
+    """Compute row o = exp(row a).
+
+    Args:
+        r: registers.
+        o: row of the result.
+        a: row of the argument.
+        w: number of slots in use.
+    """
     far = False
     for i in range(w):
         x = r[a, i]
@@ -143,7 +159,15 @@ def grow(r: Numbers, o: int, a: int, w: int) -> None:
 
 
 def execute(code: Table, first: int, last: int, r: Numbers, w: int) -> None:
-    """Instructions first to last - 1 on the registers r, in w slots."""
+    """Run instructions first to last - 1 on the registers.
+
+    Args:
+        code: (n, 5) instructions.
+        first: index of the first instruction.
+        last: index after the last instruction.
+        r: registers.
+        w: number of slots in use.
+    """
     for n in range(first, last):
         op = code[n, 0]
         o = code[n, 1]
@@ -193,7 +217,16 @@ def execute(code: Table, first: int, last: int, r: Numbers, w: int) -> None:
 
 
 def rarer(op: int, r: Numbers, o: int, a: int, b: int, w: int) -> None:
-    """The other instructions."""
+    """Run an instruction that is not in the common ones of `execute`.
+
+    Args:
+        op: operation code.
+        r: registers.
+        o: row of the result.
+        a: row of the first argument.
+        b: row of the second argument.
+        w: number of slots in use.
+    """
     for i in range(w):
         x = r[a, i]
         y = r[b, i]

@@ -1,7 +1,7 @@
-"""What happens to one lane between two steps: impacts, standstill, breaking loose, bends.
+"""Events of one element: impacts, standstill, break-away and step-size control.
 
-The same rules as in `sims.engines.batch.stepping`, `sims.engines.batch.roots` and
-`sims.engines.ground`, which state them; the numbers of equations are theirs. `i` is a slot.
+The rules are those of `sims.engines.batch.stepping`, `sims.engines.batch.roots` and
+`sims.engines.ground`; equation numbers refer to these modules. `i` is the index of a slot.
 """
 
 from __future__ import annotations
@@ -77,7 +77,15 @@ STILL = stepping.STILL
 
 
 def dot(a: Numbers, one: int, other: int, d: int, i: int) -> float:
-    """Inner product of two vectors, from these rows on."""
+    """Return the inner product of two vectors.
+
+    Args:
+        a: numbers of the slots.
+        one: first row of the first vector.
+        other: first row of the second vector.
+        d: number of dimensions.
+        i: index of the slot.
+    """
     total = a[one, i] * a[other, i]
     for k in range(1, d):
         total += a[one + k, i] * a[other + k, i]
@@ -85,14 +93,28 @@ def dot(a: Numbers, one: int, other: int, d: int, i: int) -> float:
 
 
 def length(a: Numbers, one: int, d: int, i: int) -> float:
-    """Magnitude of a vector."""
+    """Return the magnitude of a vector.
+
+    Args:
+        a: numbers of the slots.
+        one: first row of the vector.
+        d: number of dimensions.
+        i: index of the slot.
+    """
     if d == 1:
         return abs(a[one, i])  # type: ignore[no-any-return]
     return np.sqrt(dot(a, one, one, d, i))  # type: ignore[no-any-return]
 
 
 def root(value: float, rate: float, later: float, h: float) -> float:
-    """Seconds to the last root of the parabola; see `sims.engines.batch.roots`."""
+    """Return the seconds to the last root of a parabola; see `sims.engines.batch.roots`.
+
+    Args:
+        value: value >= 0 at the beginning.
+        rate: rate at the beginning.
+        later: value < 0 after h seconds.
+        h: step size in seconds.
+    """
     bend = (value + h * rate - later) / (h * h)
     turn = np.sqrt(rate * rate + 4.0 * bend * value)
     seconds = 2.0 * value / (turn - rate) if rate < 0.0 else (turn + rate) / (2.0 * bend)
@@ -100,7 +122,13 @@ def root(value: float, rate: float, later: float, h: float) -> float:
 
 
 def bent(program: Program, block: Block, i: int) -> bool:
-    """Whether forces bend too much in the step just tried; sets how long the next may be."""
+    """Return whether forces are too nonlinear in the step just tried; set the next step size.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        i: index of the slot.
+    """
     a = block.a
     d = program.flags[DIMENSIONS]
     h = a[H, i]
@@ -129,18 +157,26 @@ def bent(program: Program, block: Block, i: int) -> bool:
     if sharp:
         a[LIMIT, i] = SHORTENED * h
     elif h >= a[LIMIT, i]:
-        # The limit doubles with each step that is made at it: what bent may still be near.
+        # The limit doubles with each accepted step of that length, as the nonlinearity may still be
+        # near.
         a[LIMIT, i] = min(2.0 * a[LIMIT, i], a[LONGEST, i])
     return sharp
 
 
 def is_open(block: Block, i: int) -> bool:
-    """Whether it is under way to no event, and not after too many."""
+    """Return whether the element has no pending event and not too many events in its step."""
     return bool(block.n[GOAL, i] == NOTHING and block.n[EVENTS, i] < MANY)
 
 
 def interrupted(program: Program, work: Work, block: Block, i: int) -> bool:
-    """Whether something happens within the step just tried; sets what and when."""
+    """Return whether an event is within the step just tried; schedule the event.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        i: index of the slot.
+    """
     a = block.a
     d = program.flags[DIMENSIONS]
     h = a[H, i]
@@ -167,7 +203,7 @@ def interrupted(program: Program, work: Work, block: Block, i: int) -> bool:
         if sticks and (watched or to_loose):
             before = a[BEFORE, i]
             after = a[AFTER, i]
-            # On its way it is asked again, a little late being good enough.
+            # A scheduled break-away is checked again with a tolerance.
             if after > (PUNCTUAL * (after - before) if to_loose else 0.0):
                 seconds = h * (before / (before - after) + 0.1 * PUNCTUAL)
                 expect(block, i, seconds, LOOSE)
@@ -176,7 +212,14 @@ def interrupted(program: Program, work: Work, block: Block, i: int) -> bool:
 
 
 def expect(block: Block, i: int, seconds: float, goal: int) -> None:
-    """Note to what and when the next step leads; of two events the first counts."""
+    """Schedule an event at the end of the next step; of two events the first counts.
+
+    Args:
+        block: buffers of the slots.
+        i: index of the slot.
+        seconds: seconds to the event.
+        goal: kind of event.
+    """
     if seconds < block.a[TRY, i]:
         block.a[TRY, i] = min(max(seconds, 0.0), block.a[H, i])
         block.n[GOAL, i] = goal
@@ -184,19 +227,35 @@ def expect(block: Block, i: int, seconds: float, goal: int) -> None:
 
 
 def reach(program: Program, work: Work, block: Block, i: int) -> None:
-    """Let happen what a step led to."""
+    """Apply the event to which the step led.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        i: index of the slot.
+    """
     goal = block.n[GOAL, i]
     if goal == IMPACT:
         strike(program, work, block, i, K4)
     elif goal == STANDSTILL:
         stop(program, block, i)
-    # Breaking loose needs nothing done: the next step finds that the lane slips.
+    # Break-away needs no action: the next step finds that the element slips.
     block.a[TRY, i] = np.inf
     block.n[GOAL, i] = NOTHING
 
 
 def correct(block: Block, i: int, seconds: float) -> float:
-    """Move the lane's clock by `seconds`, no longer than a step; by how much it has moved."""
+    """Move the element's clock, at most by one step.
+
+    Args:
+        block: buffers of the slots.
+        i: index of the slot.
+        seconds: time correction in seconds; NaN counts as zero.
+
+    Returns:
+        The applied correction in seconds.
+    """
     step = block.a[LONGEST, i]
     if seconds != seconds:
         seconds = 0.0
@@ -207,7 +266,15 @@ def correct(block: Block, i: int, seconds: float) -> float:
 
 
 def strike(program: Program, work: Work, block: Block, i: int, k: int) -> None:
-    """The impact to which a step led but for rounding; rows k are the acceleration before it."""
+    """Apply the impact to which a step led up to rounding.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        i: index of the slot.
+        k: first row of the acceleration before the impact.
+    """
     a = block.a
     d = program.flags[DIMENSIONS]
     floor = work.ground[FLOOR, block.n[LANE, i]]
@@ -224,19 +291,28 @@ def strike(program: Program, work: Work, block: Block, i: int, k: int) -> None:
         acceleration = a[k + j, i]
         a[X + j, i] += late * (a[V + j, i] + 0.5 * late * acceleration)
         a[V + j, i] += late * acceleration
-    # On the ground to the last bit and not moving up, or the next step would strike it again.
+    # Exactly on the ground and not moving up, otherwise the next step would contain the same
+    # impact.
     a[high, i] = floor
     a[up, i] = smaller_than_nothing(a[up, i])
     thrown(program, work, block, i, pull)
 
 
 def smaller_than_nothing(rate: float) -> float:
-    """At most zero."""
+    """Return the rate if it is negative, otherwise zero; NaN stays NaN."""
     return rate if rate <= 0.0 or rate != rate else 0.0
 
 
 def thrown(program: Program, work: Work, block: Block, i: int, pull: float) -> None:
-    """What the ground makes of the velocity; `pull` is the acceleration upward."""
+    """Compute the velocity after an impact.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        i: index of the slot.
+        pull: upward acceleration before the impact.
+    """
     a = block.a
     r = block.r
     d = program.flags[DIMENSIONS]
@@ -244,7 +320,8 @@ def thrown(program: Program, work: Work, block: Block, i: int, pull: float) -> N
     lane = block.n[LANE, i]
     up = V + d - 1
     speed = abs(a[up, i])
-    # All slots are asked although only this one struck: the numbers of the others are not read.
+    # The program runs on all slots although only this one has an impact; the results of the others
+    # are not used.
     width = r.shape[1]
     for s in range(width):
         r[rows[IN_E], s] = work.ground[RESTITUTION, lane]
@@ -273,7 +350,14 @@ def thrown(program: Program, work: Work, block: Block, i: int, pull: float) -> N
 
 
 def is_over(block: Block, i: int, leaves: float, down: float) -> bool:
-    """Whether bouncing is over, after an impact that would be left with this speed."""
+    """Return whether bouncing is finished after an impact.
+
+    Args:
+        block: buffers of the slots.
+        i: index of the slot.
+        leaves: rebound speed.
+        down: downward acceleration.
+    """
     if not down > 0.0:
         block.n[SHORTS, i] = 0
         return False
@@ -283,7 +367,13 @@ def is_over(block: Block, i: int, leaves: float, down: float) -> bool:
 
 
 def stop(program: Program, block: Block, i: int) -> None:
-    """The lane has lost its speed along its way but for rounding."""
+    """Stop the element, which has lost its speed along its direction up to rounding.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        i: index of the slot.
+    """
     a = block.a
     d = program.flags[DIMENSIONS]
     slows = dot(a, K4, WAY, d, i)
@@ -295,7 +385,7 @@ def stop(program: Program, block: Block, i: int) -> None:
     along = dot(a, V, WAY, d, i)
     for k in range(d):
         a[V + k, i] -= a[WAY + k, i] * along
-    # Exactly zero, not nearly: only a lane of no speed at all can stick.
+    # The speed becomes exactly zero, because only an element with zero speed can stick.
     guided = program.flags[GUIDED]
     if length(a, V, guided, i) <= STILL * length(a, K4, guided, i) * a[LONGEST, i]:
         for k in range(guided):

@@ -1,7 +1,8 @@
-"""Expressions of numbers: what a system's and its effects' array functions compute for one lane.
+"""Expression graph of the numbers that system and effects compute for one batch element.
 
-A node is an operation on nodes, an input or a constant. Equal expressions are one node, so what two
-effects both ask for is computed once; what depends on constants alone is computed here.
+A node is an operation on nodes, an input or a constant. Equal expressions are one node
+(common-subexpression elimination), so that a value used by two effects is computed once.
+Expressions of constants are evaluated here.
 """
 
 from __future__ import annotations
@@ -18,22 +19,22 @@ OPERATIONS: tuple[str, ...] = (
     *("sign", "tan", "tanh", "arctan", "arctan2", "log", "expm1", "log1p"),
     *("floor", "ceil", "rint", "sinh", "cosh", "arcsin", "arccos", "hypot", "copysign"),
 )
-"""By their codes in a program; all but `where` are numpy's universal functions of that name."""
+"""Operations in the order of their codes; all except `where` are NumPy functions of that name."""
 CODES = {name: code for code, name in enumerate(OPERATIONS)}
 
 CONSTANT, LANE, MOMENT, IMPACT = range(4)
-"""How often a value changes: never; from lane to lane; from instant to instant; at impacts."""
+"""Change frequency of a value: never, per batch element, per evaluation, or per impact."""
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One number.
+    """Node of an expression graph: one number.
 
     Attributes:
         operation: a name of `OPERATIONS`, ``input`` or ``constant``.
-        args: what it is computed from.
-        value: of a constant.
-        changes: how often.
+        args: argument nodes.
+        value: value of a constant.
+        changes: change frequency, from CONSTANT to IMPACT.
     """
 
     operation: str
@@ -43,22 +44,27 @@ class Node:
 
 
 class Graph:
-    """Makes nodes, equal ones once."""
+    """Factory of nodes in which equal expressions are one node."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[object, ...], Node] = {}
 
     def constant(self, value: float) -> Node:
-        """A number; zeros of either sign and every NaN are told apart."""
+        """Return the node of a number; zeros of different sign and different NaN are distinct."""
         bits = np.float64(value).tobytes()
         return self._once(("constant", bits), lambda: Node("constant", value=float(value)))
 
     def input(self, changes: int) -> Node:
-        """A new input."""
+        """Return a new input node with this change frequency."""
         return Node("input", changes=changes)
 
     def apply(self, operation: str, *args: Node) -> Node:
-        """An operation on nodes."""
+        """Return the node of an operation on nodes.
+
+        Args:
+            operation: a name of `OPERATIONS`.
+            *args: argument nodes.
+        """
         if all(arg.changes == CONSTANT for arg in args):
             return self.constant(_computed(operation, [arg.value for arg in args]))
         changes = max(arg.changes for arg in args)

@@ -1,5 +1,7 @@
-"""Machine code in the user's cache: a file named for all that it depends on, made by one process
-while the others wait.
+"""Cache of machine code on disk.
+
+The name of a file contains a hash of everything on which the code depends. One process compiles the
+code while the others wait.
 """
 
 from __future__ import annotations
@@ -14,19 +16,19 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 def is_off() -> bool:
-    """Whether the user wants no machine code."""
+    """Return whether the user has disabled compilation."""
     return os.environ.get("SIMGAP_COMPILED") == "off"
 
 
 def folder() -> Path:
-    """$SIMGAP_COMPILED, else simgap/ in the user's cache folder."""
+    """Return the cache folder: $SIMGAP_COMPILED, else simgap/ in the user's cache folder."""
     if named := os.environ.get("SIMGAP_COMPILED"):
         return Path(named)
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "simgap"
 
 
 def read(path: Path) -> bytes | None:
-    """What was kept; None if there is nothing, or it is damaged."""
+    """Return the cached content; None if it does not exist or is damaged."""
     try:
         data = path.read_bytes()
     except OSError:
@@ -36,15 +38,18 @@ def read(path: Path) -> bytes | None:
 
 
 def made_once(path: Path, make: Callable[[], bytes], waits: Callable[[], None]) -> bytes:
-    """What is kept at `path`, made by one of all processes that ask for it.
+    """Return the cached content of a file, made by one of all processes that request it.
 
     Args:
-        path: of the file.
-        make: its content, if nobody has made it.
-        waits: called once if another process is at it.
+        path: path of the file.
+        make: function that makes the content if it does not exist.
+        waits: called once if another process is making the content.
+
+    Returns:
+        The content.
 
     Raises:
-        OSError: there is no place for it.
+        OSError: the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with _alone(path.with_suffix(".lock"), waits):
@@ -57,8 +62,8 @@ def made_once(path: Path, make: Callable[[], bytes], waits: Callable[[], None]) 
 
 
 def _write(path: Path, content: bytes) -> None:
-    """All at once or not at all."""
-    # The same name each time: what a killed process leaves of it is overwritten by the next.
+    """Write a file atomically, with the hash of its content."""
+    # The temporary name is fixed, so that the file of a killed process is overwritten by the next.
     partial = path.with_suffix(".part")
     try:
         partial.write_bytes(hashlib.sha256(content).digest() + content)
@@ -69,7 +74,7 @@ def _write(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def _alone(path: Path, waits: Callable[[], None]) -> Iterator[None]:
-    """While no other process is in here with this path, where the system knows how to tell."""
+    """Hold an exclusive lock between processes, if the operating system supports it."""
     try:
         import fcntl
     except ImportError:

@@ -1,4 +1,4 @@
-"""What the compiled engine works on, as plain tuples of arrays, and the rows of its tables."""
+"""Data layout of the compiled engine: tuples of arrays, and the rows of its tables."""
 
 from __future__ import annotations
 
@@ -10,27 +10,28 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 Numbers = NDArray[np.float64]
 Row = NDArray[np.float64]
-"""One number a lane."""
+"""Array with one number per batch element."""
 Table = NDArray[np.int64]
 
 WIDTH = 32
-"""Slots of a block: lanes that are stepped side by side."""
+"""Number of slots of a block: elements that are stepped together."""
 LARGEST = 6
-"""Coordinates that a system may have."""
+"""Maximum number of coordinates of a system."""
 
 
 class Program(NamedTuple):
-    """What a system with some effects computes, as instructions on registers.
+    """Force program of a system with some effects: instructions on registers.
 
     Attributes:
-        code: (n, 5) operation, result, three arguments.
-        ends: where its parts begin and end: what a lane's parameters settle; forces; impacts.
-        rows: registers of t, x, v, inputs, parameters, restitution, friction of the ground and
-            speed going in; of dry friction's limit, restitution and friction of
-            the ground coming out.
+        code: (n, 5) operation, result register, three argument registers.
+        ends: (4,) boundaries of its parts: values that depend on parameters alone; forces; impacts.
+        rows: (11,) input registers of t, x, v, inputs, parameters, restitution, friction of the
+            ground and speed; output registers of the limit of dry friction, restitution and
+            friction of the ground.
         out: (D,) registers of the force.
-        flags: dimensions D; whether dry friction acts, forces of effects act, it bounces; how many
-            coordinates, the first ones, dry friction acts on.
+        flags: (5,) number of dimensions D; whether dry friction acts; whether forces of effects
+            act; whether it bounces; number of coordinates, counted from the first, on which dry
+            friction acts.
     """
 
     code: Table
@@ -41,22 +42,22 @@ class Program(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Lanes of one program; N of them may be chosen out of more, L.
+    """Batch elements of one program; N of them are selected out of L.
 
     Attributes:
-        order: (N,) which lanes, in the order in which they begin.
-        parameters: (N, P) of the program, in that order.
+        order: (N,) selected elements in the order in which they begin.
+        parameters: (N, P) parameters of the program, in that order.
         mass: (L,) generalised inertia.
         x: (L, D) initial position.
         v: (L, D) initial velocity.
-        steps: (L or 1, S) seconds.
-        inputs: (U, L or 1, S).
-        longest: (L,) seconds a step may last.
-        planned: (L,) how many steps are planned.
-        ground: (4, L) floor, restitution, friction, least share of tangential speed kept.
-        every: a state is kept after so many steps.
-        patience: a lane is given up that needs so many times the planned steps.
-        kept: (L, R, 3 D) the states, to be filled in.
+        steps: (L or 1, S) step sizes in seconds.
+        inputs: (U, L or 1, S) inputs.
+        longest: (L,) longest step in seconds.
+        planned: (L,) number of planned steps.
+        ground: (4, L) floor, restitution, friction, minimum remaining fraction of tangential speed.
+        every: number of steps between recorded states.
+        patience: maximum number of steps of an element, as a multiple of the planned ones.
+        kept: (L, R, 3 D) recorded states, to be filled in.
     """
 
     order: Table
@@ -75,12 +76,12 @@ class Work(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Room to work in.
+    """Buffers of a block.
 
     Attributes:
         r: (., WIDTH) registers.
-        a: (., WIDTH) numbers of each slot, rows as below.
-        n: (., WIDTH) whole numbers of each slot, rows as below.
+        a: (., WIDTH) floating-point numbers of each slot; rows as below.
+        n: (., WIDTH) integers of each slot; rows as below.
     """
 
     r: Numbers
@@ -94,7 +95,8 @@ IN_T, IN_X, IN_V, IN_U, IN_P, IN_E, IN_MU, IN_SPEED, OUT_LIMIT, OUT_E, OUT_MU = 
 DIMENSIONS, DRY, PUSHED, BOUNCES, GUIDED = range(5)
 # Rows of `Work.ground`.
 FLOOR, RESTITUTION, RUBBING, LEAST = range(4)
-# Rows of `Block.a`: one of each for a slot; then of each vector the first of LARGEST.
+# Rows of `Block.a`: first the rows with one number per slot, then the first of the LARGEST rows of
+# each vector.
 (
     T,
     LEFT,
@@ -122,11 +124,11 @@ PLACE, LANE, STEP, GOAL, EVENTS, SHORTS, BEGINS, STICKS, RESTS, IDLE, BUSY, ASKE
 WHOLE = ASKED + 6
 
 NOTHING, IMPACT, STANDSTILL, LOOSE = range(4)
-"""What a slot's next step leads to."""
+"""Event to which a slot's next step leads."""
 
 
 def room(registers: int) -> Block:
-    """A block of this size."""
+    """Allocate the buffers of a block with this number of registers."""
     r = np.zeros((registers, WIDTH))
     return Block(r, np.zeros((ROWS, WIDTH)), np.zeros((WHOLE, WIDTH), dtype=np.int64))
 
@@ -134,10 +136,18 @@ def room(registers: int) -> Block:
 def check(
     program: Program, work: Work, block: Block, w: int, spans: Numbers, parts: Numbers
 ) -> None:
-    """See that all arrays are as their classes say, for code that does not look.
+    """Check that all arrays have the specified shapes, because machine code does not check them.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
+        spans: (L,) step sizes in seconds.
+        parts: (L,) numbers of parts.
 
     Raises:
-        ValueError: one is not.
+        ValueError: an array is not as specified.
     """
     lanes, d = work.x.shape
     chosen, columns = work.parameters.shape

@@ -1,4 +1,7 @@
-"""Which systems and effects compile; those that do not are told once, and stepped in numpy."""
+"""Compilability of systems and effects.
+
+Those that cannot be compiled are reported once and stepped in NumPy.
+"""
 
 from __future__ import annotations
 
@@ -35,16 +38,20 @@ _tracings: dict[tuple[type[System], Names], Tracing | None] = {}
 _effects: dict[tuple[type[System], Names, type[Effect]], bool] = {}
 _lock = Lock()
 _TOLERANCE = 1e-9
-"""Share of the largest number by which a program may differ from what it was traced from."""
+"""Largest relative difference between a program and the functions from which it was traced."""
 _PLAIN = 0.6, 0.2
-"""Restitution and friction of the ground, to ask effects with."""
+"""Restitution and friction of the ground with which effects are tested."""
 
 
 def model(lanes: Lanes, chosen: Indices, effects: Sequence[Effect]) -> Model | None:
-    """The program for the lanes `chosen`, on which these effects act; None if it does not
-    compile.
+    """Return the program for some elements; None if it cannot be compiled.
+
+    Args:
+        lanes: whole batch.
+        chosen: (n,) indices of the elements.
+        effects: effects that act on them.
     """
-    # One thread at a time: what another has half traced must not pass for what does not compile.
+    # The lock prevents that a trace in progress in another thread is taken as not compilable.
     with _lock:
         tracing = _traced(lanes, chosen)
         if tracing is None:
@@ -64,7 +71,7 @@ def _traced(lanes: Lanes, chosen: Indices) -> Tracing | None:
             tracing = Tracing(system, key[1])
             _check(tracing.model([]), lanes, chosen, [], system)
             _tracings[key] = tracing
-        # Whatever a user's system raises when it is asked with what is no array.
+        # A user's system may raise any error when called with traced arrays.
         except Exception as reason:
             _tell(f"system {system.name}", reason)
     return _tracings[key]
@@ -89,7 +96,7 @@ def _names(lanes: Lanes) -> Names:
 
 
 def _tell(what: str, reason: Exception) -> None:
-    """One line, once a process."""
+    """Write one line to the standard error output, once per process."""
     text = str(reason) or type(reason).__name__
     sys.stderr.write(f"simgap: {what} is stepped without the compiler: {text}\n")
 
@@ -97,10 +104,17 @@ def _tell(what: str, reason: Exception) -> None:
 def _check(
     made: Model, lanes: Lanes, chosen: Indices, effects: Sequence[Effect], of: System | Effect
 ) -> None:
-    """See that the program gives what the arrays give, on one lane at two instants.
+    """Check that the program agrees with the array functions, on one element at two states.
+
+    Args:
+        made: traced program.
+        lanes: whole batch.
+        chosen: (n,) indices of the elements.
+        effects: effects in the program.
+        of: system or effect under test.
 
     Raises:
-        UntracedError: it does not, or what was traced has a state of its own.
+        UntracedError: the results differ, or the traced object has its own state.
     """
     if getattr(of, "__dict__", None):
         raise UntracedError("it has a state of its own")
@@ -125,7 +139,7 @@ def _check(
 
 
 def _registers(made: Model, one: Lanes, inputs: Mapping[str, Array]) -> Array:
-    """The registers of a program, with all that one lane brings."""
+    """Return the registers of a program with the values of one element."""
     rows = made.program.rows
     r = made.room().r
     columns = [one.theta, *one.constants.values(), *(c[:, :, 0].T for _, c in one.effects)]
@@ -140,7 +154,7 @@ def _registers(made: Model, one: Lanes, inputs: Mapping[str, Array]) -> Array:
 
 
 def _at(made: Model, r: Array, t: float, x: Array, v: Array) -> tuple[Array, Array]:
-    """Force (D,) and limit of dry friction (1,) at an instant."""
+    """Return the force (D,) and the limit of dry friction (1,) of a program at one state."""
     rows = made.program.rows
     r[rows[IN_T], 0] = t
     r[rows[IN_X] : rows[IN_X] + x.size, 0] = x
@@ -150,7 +164,7 @@ def _at(made: Model, r: Array, t: float, x: Array, v: Array) -> tuple[Array, Arr
 
 
 def _struck(made: Model, r: Array, speed: float) -> Array:
-    """Restitution and friction (2,) of an impact, by the program."""
+    """Return restitution and friction (2,) of an impact, computed by the program."""
     rows = made.program.rows
     r[rows[IN_E]], r[rows[IN_MU]], r[rows[IN_SPEED]] = *_PLAIN, speed
     evaluate.execute(made.program.code, made.program.ends[2], made.program.ends[3], r, 1)
@@ -159,7 +173,7 @@ def _struck(made: Model, r: Array, speed: float) -> Array:
 
 
 def _strikes(effects: Sequence[tuple[Effect, Array]], speed: float) -> Array:
-    """The same by the arrays."""
+    """Return restitution and friction (2,) of an impact, computed by the array functions."""
     e, mu = (np.full((1, 1), value) for value in _PLAIN)
     for effect, c in effects:
         if isinstance(effect, Contact):

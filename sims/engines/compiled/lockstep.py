@@ -1,7 +1,7 @@
-"""Steps lanes that nothing can happen to, and that share their steps: all of a block at once.
+"""Step a block whose elements share their steps and have no events.
 
-They are lanes of a smooth program whose steps are not divided. The numbers are, to the last bit,
-those of `sims.engines.compiled.advance`, which asks every lane in every step what it needs.
+They are elements of a smooth program whose steps are not divided. The results are, bit for bit,
+those of `sims.engines.compiled.advance`, which checks every element in every step.
 """
 
 from __future__ import annotations
@@ -29,7 +29,14 @@ from sims.engines.compiled.kinds import (
 
 
 def march(program: Program, work: Work, block: Block, w: int) -> None:
-    """All steps of all lanes, w at a time."""
+    """Make all steps of all elements, w at a time.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
+    """
     a = block.a
     end = work.steps.shape[1]
     for first in range(0, work.order.size, w):
@@ -54,7 +61,14 @@ def march(program: Program, work: Work, block: Block, w: int) -> None:
 
 
 def pass_by(program: Program, block: Block, w: int, h: float) -> None:
-    """Make the step just tried, of h seconds."""
+    """Accept the step of h seconds just tried.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+        h: step size in seconds.
+    """
     a = block.a
     for k in range(program.flags[DIMENSIONS]):
         for i in range(w):
@@ -66,7 +80,15 @@ def pass_by(program: Program, block: Block, w: int, h: float) -> None:
 
 
 def feel_alike(program: Program, work: Work, block: Block, w: int, step: int) -> None:
-    """Set the inputs of this step; behind the last step, the last."""
+    """Set the inputs of this step; after the last step, those of the last step.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
+        step: index of the step.
+    """
     if work.inputs.shape[1] > 1:
         for i in range(w):
             block.n[STEP, i] = step

@@ -1,7 +1,7 @@
-"""The compiled code: loaded from the user's cache, made there the first time.
+"""Compiled kernel of the batch engine: loaded from the user's cache, or compiled once.
 
-numba translates the functions (`build`), which takes 20 s; LLVM's machine code is kept
-(`kept`) and loaded by llvmlite alone (`native`), in some hundredths of a second and without numba.
+numba translates the functions (`build`), which takes 20 s. LLVM's machine code is stored (`kept`)
+and loaded with llvmlite alone (`native`), in a few hundredths of a second and without numba.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ PARTS = (
     *("advance", "build", "clock", "dynamics", "entry", "evaluate", "events", "graph", "kinds"),
     *("lockstep", "native", "pace"),
 )
-"""Modules of this room on which the code depends."""
+"""Modules of this package on which the compiled code depends."""
 RULES = ("batch/stepping.py", "batch/pace.py", "ground.py")
-"""And those of the engines."""
+"""Files of `sims/engines` on which the compiled code depends."""
 _SECONDS = 20
-"""What compiling takes, about."""
+"""Approximate compilation time in seconds."""
 _lock = Lock()
 
 
 class Machine:
-    """The compiled functions.
+    """Compiled functions of the batch engine.
 
     Args:
-        function: of `sims.engines.compiled.entry`.
+        function: loaded function of `sims.engines.compiled.entry`.
     """
 
     def __init__(self, function: Callable[..., None]) -> None:
@@ -47,28 +47,55 @@ class Machine:
         self, program: Program, work: Work, block: Block, w: int, spans: Numbers, turn: float,
         parts: Numbers,
     ) -> None:  # fmt: skip
-        """See `sims.engines.compiled.pace`."""
+        """Choose the number of parts of each step; see `sims.engines.compiled.pace`.
+
+        Args:
+            program: program of the system and its effects.
+            work: batch of elements.
+            block: buffers of the slots.
+            w: number of slots in use.
+            spans: (L,) step sizes in seconds.
+            turn: maximum phase of an oscillation per step in radians.
+            parts: (L,) numbers of parts, updated in place.
+        """
         self._call(0, program, work, block, w, spans, turn, parts)
 
     def advance(self, program: Program, work: Work, block: Block, w: int) -> None:
-        """See `sims.engines.compiled.advance`."""
+        """Step all elements, each with its own clock; see `sims.engines.compiled.advance`.
+
+        Args:
+            program: program of the system and its effects.
+            work: batch of elements.
+            block: buffers of the slots.
+            w: number of slots in use.
+        """
         self._call(1, program, work, block, w, work.mass, 1.0, work.mass)
 
     def march(self, program: Program, work: Work, block: Block, w: int) -> None:
-        """See `sims.engines.compiled.lockstep`."""
+        """Step all elements in lockstep; see `sims.engines.compiled.lockstep`.
+
+        Args:
+            program: program of the system and its effects.
+            work: batch of elements.
+            block: buffers of the slots.
+            w: number of slots in use.
+        """
         self._call(2, program, work, block, w, work.mass, 1.0, work.mass)
 
     def execution(self, code: Table, first: int, last: int, r: Numbers) -> Callable[[], None]:
-        """What runs instructions first to last - 1 on registers, whatever these hold by then.
+        """Return a function that runs instructions on the present values of the registers.
 
         Args:
-            code: (n, 5), see `Program`.
-            first: see above.
-            last: see above.
-            r: (registers, lanes).
+            code: (n, 5) instructions; see `Program`.
+            first: index of the first instruction.
+            last: index after the last instruction.
+            r: (registers, lanes) registers.
+
+        Returns:
+            The function without arguments.
 
         Raises:
-            ValueError: the instructions reach beyond the registers.
+            ValueError: an instruction uses a register that does not exist.
         """
         whole = code.flags.c_contiguous and code.dtype == np.int64 and code.shape[1:] == (5,)
         real = r.flags.c_contiguous and r.dtype == np.float64 and r.ndim == 2
@@ -83,7 +110,7 @@ class Machine:
         pointers = [ctypes.c_void_p(address) for address in addresses]
 
         def run() -> None:
-            assert keep  # what the pointers point at
+            assert keep  # the owners of the memory at the pointers
             self._function(*pointers)
 
         return run
@@ -92,7 +119,7 @@ class Machine:
         self, what: int, program: Program, work: Work, block: Block, w: int, spans: Numbers,
         turn: float, parts: Numbers,
     ) -> None:  # fmt: skip
-        # Nothing in there looks whether it reaches beyond an array.
+        # The compiled code does not check array bounds.
         check(program, work, block, w, spans, parts)
         lanes, dimensions = work.x.shape
         chosen, columns = work.parameters.shape
@@ -119,14 +146,18 @@ _CODE, _REGISTERS = _names.index("code_at"), _names.index("r_at")
 
 
 def _address(array: Array) -> int:
-    """Where an array begins; numpy's own way takes four times as long, and there are many."""
+    """Return the address of an array; NumPy's own way takes four times as long."""
     if array.flags.writeable:
         return ctypes.addressof(_Nothing.from_buffer(array.data))
     return int(array.ctypes.data)
 
 
 def machine() -> Machine | None:
-    """The machine, compiled if it never was; None without a compiler or a place to keep it."""
+    """Return the compiled kernel, compiled on first use.
+
+    Returns:
+        The kernel; None without a compiler or a folder for the cache.
+    """
     with _lock:
         return _machine()
 
@@ -135,7 +166,8 @@ def machine() -> Machine | None:
 def _machine() -> Machine | None:
     if kept.is_off() or importlib.util.find_spec("llvmlite") is None:
         return None
-    # Whatever a compiler that does not fit this Python or its numpy says: it can be done without.
+    # The engine also works without the compiler, so any error of a compiler that does not match
+    # this Python or its NumPy is only reported.
     try:
         data = _data()
         if data is None:
@@ -148,7 +180,7 @@ def _machine() -> Machine | None:
 
 
 def _data() -> bytes | None:
-    """The code as it is kept, made if it is not; None without numba, which makes it."""
+    """Return the cached code, compiled if necessary; None without numba, which compiles it."""
     path = kept.folder() / f"stepping-{_key()}.bin"
     data = kept.read(path)
     if data is None and importlib.util.find_spec("numba") is not None:
@@ -168,13 +200,13 @@ def _wait() -> None:
 
 
 def _say(text: str) -> None:
-    """One line."""
+    """Write one line to the standard error output."""
     sys.stderr.write(f"simgap: {text}\n")
     sys.stderr.flush()
 
 
 def _key() -> str:
-    """All that the code depends on: sources, compiler, processor."""
+    """Return a hash of everything on which the code depends: sources, compiler, processor."""
     digest = hashlib.sha256()
     for source in sources():
         digest.update(source.read_bytes())
@@ -183,6 +215,6 @@ def _key() -> str:
 
 
 def sources() -> list[Path]:
-    """The files of which the code is made."""
+    """Return the source files from which the code is compiled."""
     here = Path(__file__).parent
     return [here / f"{name}.py" for name in PARTS] + [here.parent / name for name in RULES]

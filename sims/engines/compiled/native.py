@@ -1,4 +1,4 @@
-"""Machine code: made of LLVM's intermediate code, and loaded, by llvmlite alone."""
+"""Machine code: compile LLVM's intermediate code and load the result, with llvmlite alone."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 _owners: list[Any] = []
-"""What owns loaded code: it lives as long as the process."""
+"""Owners of the loaded code, which lives as long as the process."""
 _NEVER_CALLED = ("numba_", "NRT_")
-"""With which names begin of the translator's own error handling: no error is ever raised."""
+"""Prefixes of the names of numba's error handling, which is never called."""
 
 
 class UnusableError(Exception):
-    """Machine code that cannot be loaded here."""
+    """Machine code cannot be loaded in this process."""
 
 
 class Code(NamedTuple):
     """Machine code of one function.
 
     Attributes:
-        name: of the function.
-        needs: names of what it calls.
-        body: an object file.
+        name: name of the function.
+        needs: names of the external symbols that it uses.
+        body: object file.
     """
 
     name: str
@@ -32,20 +32,22 @@ class Code(NamedTuple):
     body: bytes
 
     def packed(self) -> bytes:
-        """As it is kept."""
+        """Return the code as bytes for the cache."""
         return json.dumps([self.name, list(self.needs)]).encode() + b"\0" + self.body
 
     @classmethod
     def unpacked(cls, data: bytes) -> Code:
-        """From what was kept."""
+        """Restore code from the bytes of `packed`."""
         head, body = data.split(b"\0", 1)
         name, needs = json.loads(head)
         return cls(name, tuple(needs), body)
 
 
 def processor() -> list[str]:
-    """What code depends on beside its source: llvmlite's version, name and abilities of the
-    processor.
+    """Return what the code depends on in addition to its source.
+
+    Returns:
+        llvmlite's version, and name and features of the processor.
     """
     import llvmlite
     import llvmlite.binding as llvm
@@ -55,14 +57,22 @@ def processor() -> list[str]:
 
 
 def made(text: str, name: str) -> Code:
-    """Machine code of intermediate code, for the processor at hand."""
+    """Compile intermediate code to machine code for the present processor.
+
+    Args:
+        text: LLVM intermediate code.
+        name: name of the function.
+
+    Returns:
+        The machine code.
+    """
     import llvmlite.binding as llvm
 
     module = llvm.parse_assembly(text)
     module.verify()
     for thing in (*module.functions, *module.global_variables):
         if not thing.is_declaration and thing.name != name:
-            thing.linkage = "internal"  # so that nothing is kept that is written out everywhere
+            thing.linkage = "internal"  # so that inlined functions are not also emitted
     target = _target(llvm)
     tuning = llvm.create_pipeline_tuning_options(speed_level=3)
     tuning.loop_vectorization = True
@@ -77,10 +87,17 @@ def made(text: str, name: str) -> Code:
 
 
 def loaded(code: Code, pointers: int) -> Callable[..., None]:
-    """The function, of so many pointers.
+    """Load the machine code of a function.
+
+    Args:
+        code: machine code.
+        pointers: number of pointer arguments of the function.
+
+    Returns:
+        The function.
 
     Raises:
-        UnusableError: something that it calls is not there; LLVM would end the process.
+        UnusableError: a required symbol is missing; LLVM itself would end the process.
     """
     import llvmlite.binding as llvm
 
@@ -99,7 +116,7 @@ def loaded(code: Code, pointers: int) -> Callable[..., None]:
 
 
 def _target(llvm: Any) -> Any:
-    """The processor at hand."""
+    """Return the target machine of the present processor."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     return llvm.Target.from_default_triple().create_target_machine(

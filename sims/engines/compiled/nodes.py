@@ -1,4 +1,4 @@
-"""Arrays of nodes: numbers as nodes, and operations element by element."""
+"""Arrays of expression nodes: numbers as nodes, and elementwise operations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OTHERWISE_NAMED = {
     "fmin": "minimum",
     "float_power": "power",
 }
-"""Functions that do the same to what is traced, but for where there is no number."""
+"""NumPy functions that are traced as another operation; they differ only for NaN."""
 SWAPPED = {"greater": "less", "greater_equal": "less_equal"}
 MASKS = {
     *("less", "less_equal", "equal", "not_equal", "logical_and", "logical_or", "logical_not"),
@@ -29,30 +29,34 @@ MOVING = {
     *("transpose", "moveaxis", "squeeze", "expand_dims", "copy", "tile", "repeat", "roll", "flip"),
     *("split", "atleast_1d", "atleast_2d", "take", "broadcast_arrays", "swapaxes", "ravel"),
 }
-"""Functions that move elements and do nothing else."""
+"""Functions that only rearrange elements."""
 
 
 class UntracedError(TypeError):
-    """Something that cannot be traced."""
+    """Operation or value that cannot be traced."""
 
 
 def one(node: Node) -> Any:
-    """A node as an array without dimensions."""
+    """Return a node as an array without dimensions."""
     result = np.empty((), dtype=object)
     result[()] = node
     return result
 
 
 def array(nodes: Any) -> Any:
-    """Nodes, or one, as an array."""
+    """Return nodes, or a single node, as an array."""
     return one(nodes) if isinstance(nodes, Node) else nodes
 
 
 def constants(graph: Graph, value: Any) -> Any:
-    """Numbers as nodes.
+    """Return numbers as an array of constant nodes.
+
+    Args:
+        graph: graph that contains the nodes.
+        value: number or array of numbers.
 
     Raises:
-        UntracedError: they are none.
+        UntracedError: the value is not numeric.
     """
     numbers = np.asarray(value)
     if numbers.dtype.kind not in "biuf":
@@ -64,10 +68,18 @@ def constants(graph: Graph, value: Any) -> Any:
 
 
 def combined(graph: Graph, name: str, args: Sequence[Any]) -> Any:
-    """An operation on arrays of nodes, element by element.
+    """Apply an operation elementwise to arrays of nodes.
+
+    Args:
+        graph: graph that contains the nodes.
+        name: name of the operation.
+        args: arrays of nodes.
+
+    Returns:
+        Array of the resulting nodes.
 
     Raises:
-        UntracedError: there is no such operation.
+        UntracedError: the operation does not exist.
     """
     if name not in CODES:
         raise UntracedError(f"numpy.{name} is not traced")

@@ -1,4 +1,4 @@
-"""How long steps may be, as `sims.engines.batch.pace` has it, for the lanes of one program."""
+"""Step-size selection as in `sims.engines.batch.pace`, for the elements of one program."""
 
 from __future__ import annotations
 
@@ -36,7 +36,17 @@ SHARE = pace.TURN / pace.DECAY
 def divide(
     program: Program, work: Work, block: Block, w: int, spans: Row, turn: float, parts: Row
 ) -> None:
-    """Raise `parts` (L,) to those in which steps of `spans` (L,) seconds must be made; w slots."""
+    """Raise `parts` to the number of parts into which steps must be divided.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
+        spans: (L,) step sizes in seconds.
+        turn: maximum phase of an oscillation per step in radians.
+        parts: (L,) numbers of parts, updated in place.
+    """
     instants = INSTANTS if work.inputs.shape[0] > 0 else 1
     for first in range(0, work.order.size, w):
         for i in range(w):
@@ -54,13 +64,21 @@ def divide(
                     turned = np.sqrt(block.a[PEAK, i]) * spans[lane]
                     decayed = block.a[RUBBED, i] * spans[lane] * SHARE
                     needed = np.ceil(larger(turned, decayed) / turn)
-                    # What is no number tells nothing, and one part will do.
+                    # NaN does not change the number of parts.
                     if needed > parts[lane]:
                         parts[lane] = min(needed, DIVISIONS)
 
 
 def choose(work: Work, block: Block, i: int) -> None:
-    """Set at which steps of its own a lane's inputs are asked for; waiting does not count."""
+    """Select the steps of an element at which the forces are evaluated.
+
+    Steps of zero length do not count.
+
+    Args:
+        work: batch of elements.
+        block: buffers of the slots.
+        i: index of the slot.
+    """
     n = block.n
     shared = work.steps.shape[0] == 1
     if shared and i > 0:
@@ -82,7 +100,15 @@ def choose(work: Work, block: Block, i: int) -> None:
 
 
 def feel_at(program: Program, work: Work, block: Block, w: int, instant: int) -> None:
-    """Set the inputs of every lane to those at one of its instants."""
+    """Set the inputs of every element to those of one of its selected steps.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
+        instant: index of the selected step.
+    """
     first = program.rows[IN_U]
     for i in range(w):
         row = block.n[LANE, i] if work.inputs.shape[1] > 1 else 0
@@ -91,8 +117,16 @@ def feel_at(program: Program, work: Work, block: Block, w: int, instant: int) ->
 
 
 def rates(program: Program, work: Work, block: Block, w: int, still: bool) -> None:
-    """Largest change of acceleration with position, 1/s^2, into row PEAK, and with velocity, 1/s,
-    into row RUBBED.
+    """Compute the largest slopes of the acceleration with position and with velocity.
+
+    The slope with position (1/s^2) is stored in row PEAK, that with velocity (1/s) in row RUBBED.
+
+    Args:
+        program: program of the system and its effects.
+        work: batch of elements.
+        block: buffers of the slots.
+        w: number of slots in use.
+        still: whether to evaluate at rest at zero instead of the initial state.
     """
     a = block.a
     d = program.flags[DIMENSIONS]
@@ -114,12 +148,19 @@ def rates(program: Program, work: Work, block: Block, w: int, still: bool) -> No
 
 
 def changed(program: Program, block: Block, w: int, k: int, register: int, to: int) -> None:
-    """Raise row `to` to the change of acceleration with coordinate k of what begins at
-    `register`.
+    """Raise row `to` to the slope of the acceleration with one coordinate.
+
+    Args:
+        program: program of the system and its effects.
+        block: buffers of the slots.
+        w: number of slots in use.
+        k: index of the coordinate.
+        register: first register of the positions or velocities.
+        to: row of the result, PEAK for positions or RUBBED for velocities.
     """
     a = block.a
     if to == RUBBED:
-        # Beside rest and not across it: what jumps there decays no faster for it.
+        # Both velocities are on one side of rest: a discontinuity at rest is not a faster decay.
         for i in range(w):
             block.r[register + k, i] += NUDGE
         execute(program.code, program.ends[1], program.ends[2], block.r, w)

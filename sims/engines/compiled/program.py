@@ -1,7 +1,8 @@
-"""What a system with some effects computes, traced once and written as instructions.
+"""Force program of a system with effects: traced once and written as instructions.
 
-A program has three parts: what a lane's parameters settle, computed when a lane begins; the forces
-and the limit of dry friction, computed at every instant; and what effects make of an impact.
+A program has three parts: values that depend on an element's parameters alone, computed when an
+element begins; the forces and the limit of dry friction, computed at every evaluation; and the
+contact parameters with effects, computed at impacts.
 """
 
 from __future__ import annotations
@@ -28,19 +29,19 @@ from sims.engines.compiled.traced import Traced
 from sims.system import Contact, Effect, Force, Friction, Moment, System
 
 MOST = 4000
-"""Registers of a program."""
+"""Maximum number of registers of a program."""
 MODELS = 2000
-"""Programs of a system that are kept."""
+"""Maximum number of cached programs of a system."""
 
 
 class Model(NamedTuple):
-    """A program with its constants.
+    """Program with its constants.
 
     Attributes:
-        program: what is run.
-        constants: (C, WIDTH) registers from `first` on.
-        first: see `constants`.
-        registers: how many there are.
+        program: instructions and layout.
+        constants: (C, WIDTH) values of the registers from `first` on.
+        first: first register of the constants.
+        registers: number of registers.
     """
 
     program: Program
@@ -50,19 +51,24 @@ class Model(NamedTuple):
 
     @property
     def is_smooth(self) -> bool:
-        """Whether nothing can happen to a lane within a step."""
+        """Whether no event can occur within a step."""
         return not self.program.flags[DRY:GUIDED].any()
 
     def room(self) -> Block:
-        """Room to run it in."""
+        """Allocate buffers in which the constants are set."""
         block = room(self.registers)
         block.r[self.first : self.first + len(self.constants)] = self.constants
         return block
 
 
 class Names(NamedTuple):
-    """What lanes bring, in the order of the parameters: names of constants and inputs, number of
-    the system's parameters, of coordinates.
+    """Input names and sizes of batch elements, in the order of the parameters.
+
+    Attributes:
+        constants: names of the constants.
+        inputs: names of the inputs.
+        parameters: number of the system's parameters.
+        coordinates: number of coordinates.
     """
 
     constants: tuple[str, ...]
@@ -72,12 +78,12 @@ class Names(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """An effect's part in a program.
+    """Traced effect as a part of a program.
 
     Attributes:
-        coefficients: (K, 1, 1) what goes in.
-        force: (1, D), of a force.
-        limit: (1, 1), of a friction.
+        coefficients: (K, 1, 1) input nodes of the coefficients.
+        force: (1, D) force, for a force effect.
+        limit: (1, 1) friction limit, for a friction effect.
     """
 
     coefficients: Any
@@ -86,7 +92,11 @@ class Piece(NamedTuple):
 
 
 class Tracing:
-    """A system, traced, and what acts on it, as it is asked for.
+    """Traced system; effects are traced on first use.
+
+    Args:
+        system: system to trace.
+        names: input names and sizes.
 
     Raises:
         UntracedError: the system cannot be traced.
@@ -118,10 +128,10 @@ class Tracing:
         self._models: dict[tuple[type[Effect], ...], Model] = {}
 
     def model(self, effects: Sequence[Effect]) -> Model:
-        """The program of the system with these effects.
+        """Return the program of the system with these effects.
 
         Raises:
-            UntracedError: one cannot be traced.
+            UntracedError: an effect cannot be traced.
         """
         key = tuple(map(type, effects))
         if key not in self._models:
@@ -131,10 +141,10 @@ class Tracing:
         return self._models[key]
 
     def piece(self, effect: Effect) -> Piece:
-        """The effect's part.
+        """Return the traced effect.
 
         Raises:
-            UntracedError: it cannot be traced.
+            UntracedError: the effect cannot be traced.
         """
         kind = type(effect)
         if kind not in self._pieces:
@@ -177,14 +187,14 @@ class Tracing:
         )
 
     def _shaped(self, values: Any, shape: tuple[int, int]) -> Traced:
-        """What an array function gave back, in the shape that it should have."""
+        """Return the result of an array function, broadcast to its expected shape."""
         if not isinstance(values, Traced):
             values = Traced(self.graph, constants(self.graph, values))
         return Traced(self.graph, np.broadcast_to(values.nodes, shape))
 
 
 class _Composed(NamedTuple):
-    """What goes into a program, in order, and what comes out."""
+    """Input and output nodes of a program, in order."""
 
     inputs: list[list[Node]]
     force: list[Node]
@@ -194,7 +204,7 @@ class _Composed(NamedTuple):
 
 
 def _model(composed: _Composed) -> Model:
-    """What is composed, as a program."""
+    """Return the composed expressions as a program."""
     outputs = [*composed.force, *composed.limit, *composed.impact]
     written = laid_out(composed.inputs, outputs)
     limit = written.place[composed.limit[0]] if composed.limit else -1
@@ -214,13 +224,12 @@ class Written(NamedTuple):
     """Expressions as instructions on registers.
 
     Attributes:
-        code: (n, 5) operation, result, three arguments.
-        ends: (4,) where what changes from lane to lane begins and ends, then what changes from
-            instant to instant, then what does at impacts.
-        rows: the first register of each group of inputs.
+        code: (n, 5) operation, result register, three argument registers.
+        ends: (4,) boundaries of the instructions per element, per evaluation and per impact.
+        rows: first register of each group of inputs.
         place: register of each node.
-        first: the first register of constants.
-        values: (C,) of these.
+        first: first register of the constants.
+        values: (C,) constants.
     """
 
     code: Table
@@ -232,10 +241,14 @@ class Written(NamedTuple):
 
 
 def laid_out(groups: Sequence[Sequence[Node]], outputs: Sequence[Node]) -> Written:
-    """Instructions that compute the outputs from groups of inputs, each of which lies together.
+    """Return instructions that compute outputs from groups of inputs.
+
+    Args:
+        groups: groups of input nodes; the registers of a group are consecutive.
+        outputs: output nodes.
 
     Raises:
-        UntracedError: there are too many.
+        UntracedError: too many registers are needed.
     """
     place: dict[Node, int] = {}
     rows = []
@@ -245,7 +258,7 @@ def laid_out(groups: Sequence[Sequence[Node]], outputs: Sequence[Node]) -> Writt
             place[node] = len(place)
     first = len(place)
     order = _ordered(outputs)
-    # Constants lie together, so that they are set by one assignment.
+    # Constants have consecutive registers, so that they are set by one assignment.
     values = []
     for node in order:
         if node.operation == "constant":
@@ -267,7 +280,7 @@ def laid_out(groups: Sequence[Sequence[Node]], outputs: Sequence[Node]) -> Writt
 
 
 def _ordered(outputs: Sequence[Node]) -> list[Node]:
-    """All that the outputs are computed from, and they themselves, each behind its arguments."""
+    """Return the outputs and all nodes they depend on, each after its arguments."""
     order: dict[Node, None] = {}
     stack = [(node, False) for node in reversed(outputs)]
     while stack:
@@ -281,7 +294,13 @@ def _ordered(outputs: Sequence[Node]) -> list[Node]:
 
 
 def vector(graph: Graph, size: int, changes: int) -> Any:
-    """(1, size) inputs, in the place of arrays."""
+    """Return a traced array (1, size) of new inputs with this change frequency.
+
+    Args:
+        graph: graph that contains the nodes.
+        size: number of inputs.
+        changes: change frequency.
+    """
     nodes = np.empty((1, size), dtype=object)
     for k in range(size):
         nodes[0, k] = graph.input(changes)
@@ -289,5 +308,5 @@ def vector(graph: Graph, size: int, changes: int) -> Any:
 
 
 def nodes_of(*arrays: Traced) -> list[Node]:
-    """All nodes of what is traced, in order."""
+    """Return all nodes of traced arrays, in order."""
     return [node for array in arrays for node in array.nodes.ravel()]

@@ -1,4 +1,4 @@
-"""Steps lanes with the compiled engine: groups them by what acts, and lays out what it needs."""
+"""Run a batch on the compiled kernel: group elements by active effects and prepare arrays."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from sims.engines.ground import Indices
 from sims.system import Contact, Effect, Force, Friction, Lanes, Motion
 
 _EIGHT = 8
-"""Slots are used in eights, as machines compute them."""
+"""SIMD width: the number of used slots is a multiple of it."""
 _SHARE = 256
-"""Lanes that a thread has at least."""
+"""Minimum number of batch elements per thread."""
 
 
 class _Job:
-    """Lanes that are all stepped, by compiled code.
+    """Batch of stepped elements that the compiled kernel integrates.
 
     Args:
-        lanes: all of them.
-        turn: see `sims.engines.batch.pace`.
-        patience: see `sims.engines.batch.Batch`.
-        machine: the compiled functions.
-        jobs: threads.
+        lanes: whole batch.
+        turn: maximum phase of an oscillation per step in radians; see `sims.engines.batch.pace`.
+        patience: maximum number of steps; see `sims.engines.batch.Batch`.
+        machine: compiled kernel.
+        jobs: number of threads.
     """
 
     def __init__(
@@ -61,13 +61,19 @@ class _Job:
         self._v = np.ascontiguousarray(lanes.v, dtype=np.float64)
 
     def motion(self) -> Motion:
-        """What was kept."""
+        """Return the recorded trajectories."""
         x, v, a = np.split(self._kept, 3, axis=2)
         return Motion(x, v, a)
 
     def step(self, chosen: Indices, effects: Sequence[tuple[Effect, Array]]) -> bool:
-        """Make all steps of the lanes `chosen`, on which exactly these effects act, if that
-        compiles.
+        """Step the elements `chosen`, on which exactly these effects act.
+
+        Args:
+            chosen: (n,) indices of the elements.
+            effects: active effects with their coefficients (K, L, 1).
+
+        Returns:
+            Whether system and effects can be compiled; if not, nothing is done.
         """
         lanes = self._lanes
         made = known.model(lanes, chosen, [effect for effect, _ in effects])
@@ -97,11 +103,12 @@ class _Job:
         parts = self._parts[chosen]
         spans = self._spans[chosen]
         if lanes.system.bends:
-            # What swings behind the system is stepped as finely as that takes, and waited for.
+            # The fine steps that hidden states need count as planned steps.
             self._planned[chosen] *= parts
-        # A hair longer than the part, so that rounding does not leave a crumb behind the last one.
+        # Slightly longer than the part, so that rounding does not leave a tiny step after the last
+        # one.
         self._longest[chosen] = np.where(parts > 1, spans / parts * (1.0 + 1e-9), spans)
-        # Those that need many steps first: the others fill the slots beside them.
+        # Elements with many steps begin first; the others fill the remaining slots meanwhile.
         order = np.argsort(-parts, kind="stable")
         apart = len(order)
         if made.is_smooth and len(self._steps) == 1 and self._patience >= 1.0:
@@ -111,11 +118,11 @@ class _Job:
         return True
 
     def _shared(self, way: Callable[..., None], made: Model, work: Work) -> None:
-        """All steps, on several cores where that pays."""
+        """Make all steps, on several threads if there are enough elements."""
         lanes = len(work.order)
         count = min(self._jobs, max(lanes // _SHARE, 1))
-        # Every thread has some that need many steps, and room of its own; no two write the same
-        # lane, and what a lane does depends on no other.
+        # Every thread gets some elements with many steps and its own buffers. No two threads write
+        # the same element, and the result of an element does not depend on any other.
         works = [_some(work, np.arange(k, lanes, count)) for k in range(count)] if lanes else []
         if count == 1:
             for part in works:
@@ -130,14 +137,14 @@ class _Job:
 
 
 def _some(work: Work, places: Indices) -> Work:
-    """The work on the lanes at these places of its order."""
+    """Return the work on the elements at these places of its order."""
     if len(places) == len(work.order) and (places == np.arange(len(places))).all():
         return work
     return work._replace(order=work.order[places], parameters=work.parameters[places])
 
 
 def _width(work: Work) -> int:
-    """Slots that are used."""
+    """Return the number of slots in use."""
     return min(WIDTH, -(-len(work.order) // _EIGHT) * _EIGHT)
 
 
@@ -146,7 +153,7 @@ def _column(values: Array, count: int) -> Array:
 
 
 def _stacked(values: list[Array], steps: int) -> Array:
-    """(U, L or 1, S), one row where all lanes share it."""
+    """Return the inputs (U, L or 1, S), with one row if all elements share it."""
     if not values:
         return np.zeros((0, 1, steps))
     if all(value.strides[0] == 0 for value in values):
@@ -155,7 +162,7 @@ def _stacked(values: list[Array], steps: int) -> Array:
 
 
 def _ground(lanes: Lanes) -> Array:
-    """(4, L) rows as in `sims.engines.compiled.kinds`."""
+    """Return the ground parameters (4, L), rows as in `sims.engines.compiled.kinds`."""
     count = len(lanes.x)
     ground = np.zeros((4, count))
     system = lanes.system
@@ -174,8 +181,18 @@ def _ground(lanes: Lanes) -> Array:
 def step(
     lanes: Lanes, turn: float, patience: float, machine: Machine, jobs: int = 1
 ) -> tuple[Motion, Indices]:
-    """The motion of lanes that are all stepped, and which of them were left out as what acts on
-    them does not compile.
+    """Integrate stepped elements on the compiled kernel.
+
+    Args:
+        lanes: batch of elements that are all stepped.
+        turn: maximum phase of an oscillation per step in radians.
+        patience: maximum number of steps of an element, as a multiple of the planned ones.
+        machine: compiled kernel.
+        jobs: number of threads.
+
+    Returns:
+        The trajectories, and the indices of elements left out because their effects cannot be
+        compiled.
     """
     job = _Job(lanes, turn, patience, machine, jobs)
     left = [chosen for chosen, effects in _groups(lanes) if not job.step(chosen, effects)]
@@ -183,14 +200,14 @@ def step(
 
 
 def _groups(lanes: Lanes) -> list[tuple[Indices, list[tuple[Effect, Array]]]]:
-    """Lanes (n,) on which the same effects act, with these effects."""
+    """Return groups of elements (n,) with the same active effects, and these effects."""
     hooks = (Force, Friction, Contact)
     there: list[tuple[Effect, Array]] = [(e, c) for e, c in lanes.effects if isinstance(e, hooks)]
     on = [acts(c) for _, c in there]
     if not on:
         return [(np.arange(len(lanes.x)), [])]
     patterns = np.ascontiguousarray(np.array(on).T)
-    # Most calls have one group, and numpy's search for equal rows costs as much as a few lanes.
+    # Most calls have one group, and NumPy's search for equal rows costs as much as a few elements.
     if (patterns == patterns[0]).all():
         groups = {0: np.arange(len(patterns))}
     else:

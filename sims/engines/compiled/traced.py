@@ -1,8 +1,9 @@
-"""Arrays that note what is done to them: so an effect written for arrays becomes an expression.
+"""Array that records operations, so that an effect written for arrays becomes an expression.
 
-A traced array has the shape that one lane has, and a node where an array has a number. Functions of
-numpy that compute element by element, and those that only move elements, work on it; what asks for
-a value (``if``, `float`, `numpy.asarray`) or a function that is not here raises `UntracedError`.
+A traced array has the shape for one batch element, with a node in place of each number. NumPy
+functions that are elementwise, and those that only rearrange elements, work on it. Code that needs
+a value (``if``, `float`, `numpy.asarray`) and functions without a traced version raise
+`UntracedError`.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from sims.engines.compiled.nodes import (
 
 
 class Traced(NDArrayOperatorsMixin):
-    """An array of nodes of one graph.
+    """Array of nodes of one graph.
 
     Args:
-        graph: where its nodes are made.
-        nodes: any shape, dtype object.
-        mask: whether it holds truth values.
+        graph: graph that contains the nodes.
+        nodes: array of any shape with dtype object.
+        mask: whether it contains truth values.
     """
 
     def __init__(self, graph: Graph, nodes: Any, mask: bool = False) -> None:
@@ -43,58 +44,81 @@ class Traced(NDArrayOperatorsMixin):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """As an array's."""
+        """Shape, as of a NumPy array."""
         shape: tuple[int, ...] = self.nodes.shape
         return shape
 
     @property
     def ndim(self) -> int:
-        """As an array's."""
+        """Number of dimensions, as of a NumPy array."""
         return len(self.shape)
 
     @property
     def size(self) -> int:
-        """As an array's."""
+        """Number of elements, as of a NumPy array."""
         return int(self.nodes.size)
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """As an array's."""
+        """Data type: bool for a mask, otherwise float."""
         return np.dtype(bool if self.mask else float)
 
     @property
     def T(self) -> Traced:  # noqa: N802
-        """As an array's."""
+        """Transposed array, as of a NumPy array."""
         return self._like(self.nodes.T)
 
     def reshape(self, *shape: Any) -> Traced:
-        """As an array's."""
+        """Return the array in another shape, as for a NumPy array."""
         return self._like(self.nodes.reshape(*shape))
 
     def copy(self) -> Traced:
-        """As an array's."""
+        """Return a copy, as for a NumPy array."""
         return self._like(self.nodes.copy())
 
     def astype(self, kind: Any, **_: Any) -> Traced:
-        """As an array's, to numbers."""
+        """Return the array as numbers; only float64 is supported."""
         if np.dtype(kind) != np.float64:
             raise UntracedError(f"numbers as {np.dtype(kind)} are not traced")
         return Traced(self.graph, self.nodes)
 
     def sum(self, axis: Any = None, keepdims: bool = False, **_: Any) -> Traced:
-        """As an array's."""
+        """Return the sum, as for a NumPy array.
+
+        Args:
+            axis: axis of the sum; None for all elements.
+            keepdims: whether to keep the axis with size one.
+            **_: other options of NumPy, which are ignored.
+        """
         return self._reduced("add", axis, keepdims)
 
     def max(self, axis: Any = None, keepdims: bool = False, **_: Any) -> Traced:
-        """As an array's."""
+        """Return the maximum, as for a NumPy array.
+
+        Args:
+            axis: axis of the maximum; None for all elements.
+            keepdims: whether to keep the axis with size one.
+            **_: other options of NumPy, which are ignored.
+        """
         return self._reduced("maximum", axis, keepdims)
 
     def min(self, axis: Any = None, keepdims: bool = False, **_: Any) -> Traced:
-        """As an array's."""
+        """Return the minimum, as for a NumPy array.
+
+        Args:
+            axis: axis of the minimum; None for all elements.
+            keepdims: whether to keep the axis with size one.
+            **_: other options of NumPy, which are ignored.
+        """
         return self._reduced("minimum", axis, keepdims)
 
     def clip(self, low: Any, high: Any) -> Traced:
-        """As an array's."""
+        """Return the values limited to an interval, as for a NumPy array.
+
+        Args:
+            low: lower limit; None for none.
+            high: upper limit; None for none.
+        """
         return _clip(self, low, high)
 
     def __len__(self) -> int:
@@ -166,14 +190,14 @@ class Traced(NDArrayOperatorsMixin):
 
 
 def _check_place(place: Any) -> None:
-    """Refuse choosing by what is traced: how much is chosen would differ from lane to lane."""
+    """Reject a traced index, whose number of selected elements would not be constant."""
     for part in place if isinstance(place, tuple) else (place,):
         if isinstance(part, Traced):
             raise UntracedError("it chooses elements by what it computes")
 
 
 def _lifted(graph: Graph, value: Any) -> Any:
-    """What is traced, or numbers, as nodes."""
+    """Return the nodes of a traced array, or numbers as constant nodes."""
     return value.nodes if isinstance(value, Traced) else constants(graph, value)
 
 
@@ -199,7 +223,7 @@ def _elementwise(graph: Graph, name: str, args: Sequence[Any]) -> Traced:
 
 
 def _power(graph: Graph, base: Any, exponent: float) -> Traced | None:
-    """The powers that numpy computes otherwise."""
+    """Return a power that NumPy computes as a simpler operation; None for other exponents."""
     if exponent == 2.0:
         return _elementwise(graph, "multiply", (base, base))
     if exponent == 0.5:
@@ -210,7 +234,7 @@ def _power(graph: Graph, base: Any, exponent: float) -> Traced | None:
 
 
 def _bare(graph: Graph, args: Any) -> list[Any]:
-    """Arguments with nodes in place of what is traced, and of the numbers beside it."""
+    """Return arguments with traced arrays, and numbers next to them in lists, as nodes."""
 
     def bare(arg: Any) -> Any:
         if isinstance(arg, Traced):
