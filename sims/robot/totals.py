@@ -84,7 +84,7 @@ _TOTALS: Mapping[str, Reading] = {
     "actuator.damping": Reading(_servo(2), "N*m*s/rad", "N*s/m"),
     "mass.scale": Reading(lambda f, r, place: [f["body_mass"][0, r.body(place).id]], "kg"),
     "mass.offset": Reading(lambda f, r, place: f["body_ipos"][0, r.body(place).id]),
-    # The largest of the three principal moments stands for the tensor.
+    # The largest of the three principal moments represents the tensor.
     "inertia.scale": Reading(
         lambda f, r, place: [np.max(f["body_inertia"][0, r.body(place).id])], "kg*m^2"
     ),
