@@ -1,1 +1,1 @@
-"""Robots from model files: an MJCF or a URDF becomes a system, with effects at its places."""
+"""Robots read from MJCF or URDF model files, as systems with effects at places."""

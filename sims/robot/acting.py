@@ -1,4 +1,4 @@
-"""What acts on lanes of a robot: in its model, asked for in every step, or beforehand."""
+"""Effects active on a batch: written into the model, evaluated per step, or precomputed."""
 
 from __future__ import annotations
 
@@ -14,31 +14,43 @@ from sims.system import Acting, Effect
 
 
 def is_native(effect: Effect) -> bool:
-    """Whether the engine writes it into the model."""
+    """Return whether the engine writes the effect into fields of the MuJoCo model."""
     return is_series(effect) or (
         (effect.of or effect.name) in FIELDS and effect.hook in ("value", "force")
     )
 
 
 def derives(effect: Effect) -> bool:
-    """Whether MuJoCo derives constants from what it changes."""
+    """Return whether MuJoCo derives constants from the model fields that the effect changes."""
     return is_native(effect) and (is_series(effect) or FIELDS[effect.of or effect.name].derived)
 
 
 def natives(acting: Acting) -> Acting:
-    """What is written into the model."""
+    """Select the effects that are written into fields of the MuJoCo model."""
     return tuple((e, c) for e, c in acting if is_native(e))
 
 
 def is_asked(effect: Effect) -> bool:
-    """Whether its force is known only when the robot is there."""
+    """Return whether the force of the effect depends on the state of the robot.
+
+    Such a force is evaluated in every step.
+    """
     if effect.hook not in ("force", "hidden"):
         return False
     return not is_native(effect) and effect.of not in OVER_TIME
 
 
 def lanes_with(acting: Acting, count: int, which: Callable[[Effect], bool]) -> Mask:
-    """(L,) in which lanes an effect acts of those that `which` says."""
+    """Find the batch elements in which a selected effect is active.
+
+    Args:
+        acting: effects with their coefficients (K, L, 1).
+        count: number L of batch elements.
+        which: returns whether an effect is selected.
+
+    Returns:
+        (L,) whether any selected effect has a nonzero coefficient.
+    """
     there = np.zeros(count, dtype=bool)
     for effect, c in acting:
         if which(effect):
@@ -47,13 +59,30 @@ def lanes_with(acting: Acting, count: int, which: Callable[[Effect], bool]) -> M
 
 
 def part_of(acting: Acting, lanes: Places) -> Acting:
-    """What acts on some of the lanes."""
+    """Restrict active effects to some batch elements, and drop effects that are zero there.
+
+    Args:
+        acting: effects with their coefficients (K, L, 1).
+        lanes: indices of the batch elements.
+
+    Returns:
+        The effects that are active there, with their coefficients for these batch elements.
+    """
     parts = tuple((e, c[:, lanes]) for e, c in acting)
     return tuple((e, c) for e, c in parts if c.any())
 
 
 def filled(acting: Acting, n: int, count: int) -> Acting:
-    """Coefficients for all lanes of a batch, zero behind the first n."""
+    """Pad coefficients with zeros to the size of a batch.
+
+    Args:
+        acting: effects with their coefficients (K, n, 1).
+        n: number of batch elements that are in use.
+        count: number of all batch elements.
+
+    Returns:
+        The effects with their coefficients (K, count, 1).
+    """
     return tuple(
         (e, np.concatenate([c, np.zeros((len(c), count - n, 1))], axis=1)) for e, c in acting
     )

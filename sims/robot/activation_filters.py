@@ -1,13 +1,13 @@
 """First-order filters before actuators: MuJoCo's dyntype ``filter`` and ``filterexact``.
 
-With u the control, a the activation that takes its place, T the time constant and h the step,
+With the control u, the activation a that replaces it, the time constant T and the step h,
 
     filter        a[k+1] = a[k] + (h / T) (u[k] - a[k])                                         (1)
     filterexact   a[k+1] = a[k] + (1 - exp(-h / T)) (u[k] - a[k])                               (2)
 
-The activation at the start of a run is not recorded. It is, in this order: what the recording
-states; what (1) or (2) makes of the commands before the run, where they are known; the first
-command.
+The activation at the start of a run is not recorded. It is the first of these that is available:
+the value that the recording specifies; the result of (1) or (2) for the known commands before the
+run; the first command.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ from sims.robot.model import Actuator, Robot, filters, kept_with_robot
 from sims.robot.native import RK4
 
 STATE = "act."
-"""Beginning of the names under which a recording states activations."""
+"""Prefix of the names under which a recording specifies activations."""
 SHORTEST = 1e-15
 """Smallest time constant in seconds, MuJoCo's mjMINVAL."""
 SETTLED = 10.0
-"""Number of time constants after which a wrong first activation has no effect: exp(-10) of it is
-left, less than the accuracy of a simulation.
+"""Number of time constants after which a wrong initial activation has no effect.
+
+The remaining share exp(-10) is less than the accuracy of a simulation.
 """
 
 
@@ -37,11 +38,11 @@ class ActivationFilter(NamedTuple):
     """A filter before an actuator.
 
     Attributes:
-        actuator: whose.
-        address: of its activation, in MuJoCo's ``act``.
-        seconds: its time constant.
-        exact: whether (2) holds, and not (1).
-        limits: lowest and highest activation; infinite where it is not limited.
+        actuator: the actuator.
+        address: address of its activation in MuJoCo's ``act``.
+        seconds: time constant in seconds.
+        exact: whether (2) applies instead of (1).
+        limits: lowest and highest activation; infinite if not limited.
     """
 
     actuator: Actuator
@@ -52,11 +53,11 @@ class ActivationFilter(NamedTuple):
 
     @property
     def state(self) -> str:
-        """The name under which a recording states its activation."""
+        """Name under which a recording specifies the activation."""
         return STATE + self.actuator.name
 
     def clipped(self, controls: Array) -> Array:
-        """Return controls within the control range, as the filter takes them."""
+        """Return controls limited to the control range, as the filter receives them."""
         if self.actuator.range is None:
             return controls
         clipped: Array = np.clip(controls, *self.actuator.range)
@@ -66,28 +67,29 @@ class ActivationFilter(NamedTuple):
         """Compute activations at the beginnings of steps, by (1) or (2).
 
         Args:
-            controls: (n, S) of the steps.
-            begun: (n,) first activations.
-            step: seconds of a step.
-            fourth: whether the integrator is of fourth order, with which (1) and (2) agree.
+            controls: (n, S) controls of the steps.
+            begun: (n,) initial activations.
+            step: step length in seconds.
+            fourth: whether the integrator is of fourth order, for which (1) and (2) agree.
 
         Returns:
-            (n, S + 1) activations, the last one after the last step.
+            (n, S + 1) activations; the last one is after the last step.
         """
         ratio = step / max(self.seconds, SHORTEST)
         kept = float(np.exp(-ratio)) if self.exact or fourth else 1.0 - ratio
         taken = self.clipped(controls)
         decay = np.full_like(taken, kept)
         ends = recur(decay, (1.0 - decay) * taken, begun[:, None])
-        # A limit acts within the recursion, but commands that reach it stay beyond it for longer
-        # than a step: the difference lasts as long as the filter.
+        # MuJoCo applies a limit within the recursion. But commands that reach the limit stay beyond
+        # it for longer than a step, so the difference only lasts as long as the filter's time
+        # constant.
         result: Array = np.clip(np.concatenate([begun[:, None], ends], axis=1), *self.limits)
         return result
 
 
 @kept_with_robot
 def activation_filters(robot: Robot) -> tuple[ActivationFilter, ...]:
-    """Return the filters before a robot's actuators, of those with one control."""
+    """Return the filters before those actuators of a robot that have one control."""
     import mujoco
 
     model = robot.compiled
@@ -112,32 +114,49 @@ def activation_filters(robot: Robot) -> tuple[ActivationFilter, ...]:
 
 
 def is_fourth_order(integrator: int) -> bool:
-    """Whether MuJoCo's integrator of this number is of fourth order."""
+    """Return whether MuJoCo's integrator of this number is of fourth order."""
     return integrator == RK4
 
 
 def stated_activations(robot: Robot, initial: Mapping[str, float]) -> dict[str, float]:
-    """Return the activations among the initial states of a run, by name."""
+    """Return the activations among the initial states of a run, by name.
+
+    Args:
+        robot: robot with the filters.
+        initial: initial states of the run, by name.
+    """
     names = {one.state for one in activation_filters(robot)}
     return {name: value for name, value in initial.items() if name in names}
 
 
 def longest_settling(robot: Robot, initial: Mapping[str, float]) -> float:
-    """Return seconds after which no filter remembers how a run began, without those whose first
-    activation is stated.
+    """Return the time in seconds after which no filter depends on its initial activation.
+
+    Filters whose initial activation is specified are ignored.
+
+    Args:
+        robot: robot with the filters.
+        initial: initial states of the run, by name.
     """
     unknown = [one for one in activation_filters(robot) if one.state not in initial]
     return SETTLED * max((one.seconds for one in unknown), default=0.0)
 
 
 def with_history(scenario: Scenario, step: float) -> tuple[Scenario, int] | None:
-    """Return a scenario that begins as many whole steps earlier as its inputs are known before the
-    run, and the number of these steps; None where they are not known.
+    """Extend a scenario into the time before the run for which its inputs are known.
+
+    Args:
+        scenario: scenario of the run.
+        step: step length in seconds.
+
+    Returns:
+        The scenario that begins a whole number of steps earlier, and this number; None if the
+        inputs before the run are not known for at least one step.
     """
     names = [name for name in scenario.inputs if name in scenario.before]
     stamps = scenario.before[names[0]][0] if names else np.empty(0)
     steps = int(np.floor(-stamps[0] / step)) if stamps.size else 0
-    # Inputs of one run are known at the same instants.
+    # The inputs of one run must be known at equal times.
     alike = all(np.array_equal(scenario.before[name][0], stamps) for name in names)
     if steps < 1 or len(names) < len(scenario.inputs) or not alike:
         return None

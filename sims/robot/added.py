@@ -1,4 +1,4 @@
-"""What a recording adds to a model file: actuators, and the engine's step and integrator."""
+"""Actuators and engine settings that a recording adds to a model file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sims.user_toml import Pair
 
 
 class ActuatorTable(TypedDict, total=False):
-    """``[actuators.NAME]``."""
+    """Table ``[actuators.NAME]`` of a recording."""
 
     joint: str
     kind: str
@@ -23,13 +23,14 @@ class ActuatorTable(TypedDict, total=False):
     gear: float
     control_range: Pair
     force_range: Pair
-    # Read with the recording (`sims.recording.drive_switches`); here so that messages name them.
+    # These two are read with the recording (`sims.recording.drive_switches`). They are listed here
+    # so that error messages name them.
     enable: str
     disable: str
 
 
 class EngineTable(TypedDict, total=False):
-    """``[engine]``."""
+    """Table ``[engine]`` of a recording."""
 
     timestep: float
     integrator: str
@@ -42,17 +43,17 @@ GAINS: Mapping[str, tuple[str, ...]] = {
     "velocity": ("kv",),
     "pid": ("kp", "ki", "kd", "kv"),
 }
-"""By kind of actuator, its gains; the first must be given."""
+"""Gains by kind of actuator; the first one is required."""
 INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
-"""In the order of MuJoCo's mjtIntegrator."""
+"""Names of integrators, in the order of MuJoCo's mjtIntegrator."""
 SHORTEST, LONGEST = 1e-9, 1.0
-"""s of a step."""
+"""Smallest and largest allowed time step, in seconds."""
 
 
 def add_actuators(spec: Any, tables: Mapping[str, Any], source: str) -> tuple[str, ...]:
     """Add actuators to a model.
 
-    With l the gear times the joint's position, v its rate and u the control, they exert
+    With the gear times the joint's position l, its rate v and the control u, they exert
 
         motor     u                                                                             (1)
         position  kp (u - l) - kv v                                                             (2)
@@ -60,19 +61,20 @@ def add_actuators(spec: Any, tables: Mapping[str, Any], source: str) -> tuple[st
         pid       kp (u - l) + ki ∫(u - l) dt - kv v                                            (4)
         pid       kp (u - l) + ki ∫(u - l) dt + kd (du/dt - v)                                  (5)
 
-    within their force range, and the gear times that on the joint. In (5), where kd is given, the
-    actuator has a second control, the rate of u, which whoever steps the model puts in.
+    within their force range. The joint receives the gear times this force. In (5), which applies if
+    kd is given, the actuator has a second control, the rate of u; the caller that steps the model
+    must set it.
 
     Args:
-        spec: a mujoco.MjSpec; changed.
-        tables: by the actuator's name, its table as in a recording's TOML.
-        source: what messages begin with.
+        spec: a mujoco.MjSpec; it is changed in place.
+        tables: tables as in a recording's TOML, by name of the actuator.
+        source: beginning of error messages.
 
     Returns:
-        The names of those that have kd.
+        The names of the actuators with kd.
 
     Raises:
-        InputError: a table is not as it should be; names that exist are listed.
+        InputError: a table is invalid; existing names are listed.
     """
     rated = []
     for name, given in tables.items():
@@ -159,15 +161,15 @@ def _set_pid(actuator: Any, gains: dict[str, float], kd: float | None) -> None:
 
 
 def set_engine(spec: Any, table: Mapping[str, Any], source: str) -> None:
-    """Step and integrate as a recording says, in place of what the model file states.
+    """Apply the time step and integrator of a recording to a model.
 
     Args:
-        spec: a mujoco.MjSpec; changed.
+        spec: a mujoco.MjSpec; it is changed in place.
         table: ``timestep`` in s, ``integrator`` by MuJoCo's name.
-        source: what messages begin with.
+        source: beginning of error messages.
 
     Raises:
-        InputError: the table is not as it should be.
+        InputError: the table is invalid.
     """
     import mujoco
 

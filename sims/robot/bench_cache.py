@@ -1,8 +1,8 @@
-"""The batches of one robot, shared by all its simulators, within a limit of memory.
+"""Memory-limited cache of the MuJoCo batches of one robot, shared by all its simulators.
 
-Worlds of the same recording, their pieces and their finer steps have simulators of their own, whose
-batches would be equal. Each candidate that puts joints in series needs a model and batches of its
-own, and most candidates are asked for once.
+Run evaluators of one recording, of its segments and with smaller time steps have separate
+simulators, whose batches would be equal. Each candidate with joints in series needs its own model
+and batches, and most candidates are requested only once.
 """
 
 from __future__ import annotations
@@ -18,36 +18,37 @@ from sims.robot.series import Added, in_series
 from sims.robot.simulation_model import strip_assets
 
 CACHE_BYTES = 96 << 20
-"""Memory that the models with joints in series may take, in bytes; the ones that have not been
-asked for longest are dropped beyond it. The robot's own model does not count.
+"""Maximum memory of models with joints in series, in bytes.
+
+Beyond it the least recently used models are dropped. The robot's original model does not count.
 """
 
 
 class RefusedModelError(Exception):
-    """MuJoCo does not compile a model with joints in series: names the effects and its reason."""
+    """MuJoCo cannot compile a model with joints in series; states the effects and the reason."""
 
 
 @dataclass
 class _Variant:
-    """A robot with joints in series, and its batches by the options, the kind and the size."""
+    """A robot with joints in series, and its batches by options, kind and size."""
 
     robot: Robot
     benches: dict[tuple[object, ...], Bench] = field(default_factory=dict)
 
     @property
     def nbytes(self) -> int:
-        """Bytes that it takes: models, and what each lane has of its own."""
-        # The model that the robot has compiled, and about as much again in its spec.
+        """Memory of the models and of the batch elements' own fields, in bytes."""
+        # The compiled model of the robot counts twice, since its spec takes about as much memory.
         size = 2 * int(self.robot.compiled.nbuffer)
         return size + sum(bench.nbytes for bench in self.benches.values())
 
 
 class BenchCache:
-    """Batches by what acts in series, the options of the model, and the number of lanes.
+    """Cache of batches by the effects in series, the options of the model, and the batch size.
 
     Args:
-        robot: that was read.
-        limit: bytes, see `CACHE_BYTES`.
+        robot: robot as read from its model file.
+        limit: maximum memory in bytes, see `CACHE_BYTES`.
     """
 
     def __init__(self, robot: Robot, limit: int = CACHE_BYTES) -> None:
@@ -58,23 +59,23 @@ class BenchCache:
 
     @property
     def benches(self) -> list[Bench]:
-        """All that are held."""
+        """All cached batches."""
         variants = [self._own, *self._series.values()]
         return [bench for variant in variants for bench in variant.benches.values()]
 
     def bench(
         self, series: Added, derived: bool, count: int, settings: Mapping[str, float]
     ) -> Bench:
-        """Look up a batch, or make it.
+        """Return a batch from the cache, or create it.
 
         Args:
-            series: what acts in series with joints.
+            series: effects in series with joints.
             derived: whether masses or armatures change.
-            count: number of lanes.
-            settings: options of the model, as `sims.robot.lanes.Bench` takes them.
+            count: number of batch elements.
+            settings: options of the model, as for `sims.robot.lanes.Bench`.
 
         Raises:
-            RefusedModelError: MuJoCo refuses the model with these joints in series.
+            RefusedModelError: MuJoCo cannot compile the model with these joints in series.
         """
         if series in self._refused:
             raise RefusedModelError(self._refused[series])
@@ -100,11 +101,12 @@ class BenchCache:
         if not series:
             return self._own
         variant = self._series.pop(series, None) or _Variant(in_series(self._own.robot, series))
-        self._series[series] = variant  # the last one asked for
+        # The dictionary is ordered by last use, so the variant goes to the end.
+        self._series[series] = variant
         return variant
 
     def _trim(self) -> None:
-        """Drop variants, but for the last one, while they take too much."""
+        """Drop the least recently used variants, except the last one, until the limit is met."""
         sizes = {series: variant.nbytes for series, variant in self._series.items()}
         for series in list(sizes)[:-1]:
             if sum(sizes.values()) <= self._limit:
@@ -114,5 +116,5 @@ class BenchCache:
 
 @kept_with_robot
 def bench_cache(robot: Robot) -> BenchCache:
-    """The batches of a robot, which go with it."""
+    """Return the batch cache of a robot, which is stored with the robot."""
     return BenchCache(robot)

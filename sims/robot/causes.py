@@ -1,4 +1,4 @@
-"""Causes as explain states them, one by one: families become their members."""
+"""Fitted causes, with effect families resolved to single places."""
 
 from __future__ import annotations
 
@@ -15,25 +15,30 @@ if TYPE_CHECKING:
     from sims.robot.model import Robot
 
 FAMILY = "*"
-"""The place of a family."""
+"""Place of an effect family, which acts at all places of its kind."""
 
 _AXES: Mapping[str, tuple[str, ...]] = {
     "mass.offset": ("x", "y", "z"),
     "gravity.tilt": ("x", "y"),
 }
-"""Coefficients of effects that have several, in their order."""
+"""Names of the coefficients of effects with several coefficients, in their order."""
 
 
 COMPENSATED = 0.02
-"""Share of its weight that a robot with compensated gravity still feels at most."""
+"""Largest remaining share of gravity at which a robot counts as gravity-compensated."""
 
 GRAVITY_COMPENSATED = "gravity is compensated: the real robot or its controller carries its weight"
-"""What is said of a correction of gravity that takes all of it away."""
+"""Text for a gravity correction that removes gravity completely."""
 
 
 def is_gravity_compensated(effect: str, numbers: Mapping[str, Number]) -> bool:
-    """Whether a correction of gravity takes all of it away: the real robot, or its controller,
-    carries its own weight.
+    """Return whether a correction of gravity removes gravity completely.
+
+    The real robot, or its controller, then carries its own weight.
+
+    Args:
+        effect: name of the effect.
+        numbers: fitted numbers by coefficient.
     """
     return effect == "gravity.scale" and any(
         abs(1.0 + number.value) < COMPENSATED for number in numbers.values()
@@ -42,12 +47,12 @@ def is_gravity_compensated(effect: str, numbers: Mapping[str, Number]) -> bool:
 
 @dataclass(frozen=True)
 class Cause:
-    """An effect at one place, with its numbers.
+    """An effect at one place, with its fitted numbers.
 
     Attributes:
-        effect: its name, without the place.
-        place: a joint, an actuator, a body or a channel; empty for the world's.
-        numbers: by coefficient, without the place.
+        effect: name of the effect, without the place.
+        place: a joint, an actuator, a body or a channel; empty for an effect of the world.
+        numbers: fitted numbers by coefficient; the keys contain no place.
     """
 
     effect: str
@@ -56,12 +61,12 @@ class Cause:
 
     @property
     def name(self) -> str:
-        """``friction.coulomb@elbow``."""
+        """Name with place, such as ``friction.coulomb@elbow``."""
         return f"{self.effect}@{self.place}" if self.place else self.effect
 
     @property
     def coefficients(self) -> Array:
-        """(K,) its numbers in the effect's order; what is not stated is zero."""
+        """Coefficients (K,) in the order of the effect; unspecified ones are zero."""
         axes = _AXES.get(self.effect)
         if axes is None:
             return np.array([number.value for number in self.numbers.values()])
@@ -69,7 +74,7 @@ class Cause:
         return np.array([self.numbers.get(axis, zero).value for axis in axes])
 
     def told(self, recording: str) -> str:
-        """``friction.coulomb@elbow: 0.3 N*m (95 %: 0.28 to 0.32), fitted to log.csv``."""
+        """Format as ``friction.coulomb@elbow: 0.3 N*m (95 %: 0.28 to 0.32), fitted to log.csv``."""
         several = len(self.numbers) > 1
         numbers = [
             (f"{name} " if several else "") + _told(number) for name, number in self.numbers.items()
@@ -79,8 +84,9 @@ class Cause:
 
 
 def _told(number: Number) -> str:
-    """``-0.05 N*m (95 %: -0.06 to -0.04), from 0.2 to 0.15 N*m``: the last part is the number that
-    the file has before and after.
+    """Format as ``-0.05 N*m (95 %: -0.06 to -0.04), from 0.2 to 0.15 N*m``.
+
+    The last part is the number in the model file before and after.
     """
     text = f"{number.value:.4g}{_unit(number.unit)}"
     if number.low is not None and number.high is not None:
@@ -96,12 +102,12 @@ def _unit(unit: str) -> str:
 
 
 def one_by_one(robot: Robot, causes: Mapping[str, Mapping[str, Number]]) -> list[Cause]:
-    """Every cause at one place.
+    """Expand effect families to causes at one place each.
 
     Args:
-        robot: whose places a family has where its coefficients name none.
-        causes: coefficients by ``effect@place``; those of a family are keyed
-            ``coefficient@PLACE``, or without a place where they hold for all.
+        robot: robot whose places a family has if its coefficients name no places.
+        causes: coefficients by ``effect@place``. Those of a family have keys ``coefficient@PLACE``,
+            or keys without a place if they hold for all places.
     """
     found = []
     for name, numbers in causes.items():
@@ -114,7 +120,7 @@ def one_by_one(robot: Robot, causes: Mapping[str, Mapping[str, Number]]) -> list
 
 
 def _members(robot: Robot, effect: str, numbers: Mapping[str, Number]) -> list[Cause]:
-    """The members of a family."""
+    """Return the causes of one effect family."""
     by_place: dict[str, dict[str, Number]] = {}
     for key, number in numbers.items():
         coefficient, _, place = key.partition("@")
@@ -125,7 +131,7 @@ def _members(robot: Robot, effect: str, numbers: Mapping[str, Number]) -> list[C
 
 
 def _places(robot: Robot, effect: str) -> list[str]:
-    """All places of an effect that has one number for all of them."""
+    """List the places of an effect family that has one number for all places."""
     if effect.startswith("input."):
         return [actuator.name for actuator in robot.actuators if actuator.joint is not None]
     if effect.startswith("sensor."):

@@ -1,7 +1,7 @@
-"""What causes make of a robot's model: the numbers that change, stated in an MjSpec.
+"""Apply causes to a robot's model, as changed numbers of an MjSpec.
 
-This is the one place that says what a cause means for a model file; native effects mean here what
-they mean for the lanes of a simulation (`sims.robot.native`).
+This module alone defines the meaning of a cause for a model file. Model-field effects have the same
+meaning as in a simulation (`sims.robot.native`).
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from sims.robot.stated import (
 from sims.system import Element as Transmission
 
 ROUNDS = 4
-"""How often what moves along with a change is stated as it was."""
+"""Maximum number of rounds that restore values which another change has modified."""
 
 CLOSE = 1e-13
-"""Relative difference of two compiled numbers that is rounding."""
+"""Relative difference between compiled numbers that counts as rounding."""
 
 KEPT = "as it was: it would move along with another change"
 
@@ -60,7 +60,7 @@ _NOTES = {
     COULOMB: "friction.coulomb: dry friction is stiff in the file (solreffriction, "
     "solimpfriction), or it would creep",
 }
-"""What is to be known of effects that a file holds."""
+"""Notes about effects that a file contains."""
 _SOFT = (
     "friction.coulomb: dry friction has MuJoCo's soft form, since solreffriction and "
     "solimpfriction are left as they were; a joint under load creeps"
@@ -69,16 +69,16 @@ _SOFT = (
 
 @dataclass(frozen=True)
 class Applied:
-    """A robot's model with causes in it.
+    """A robot's model with causes applied.
 
     Attributes:
-        robot: it, with joints in series where causes put some.
-        text: it as MJCF, as MuJoCo writes it.
-        model: that, compiled.
-        wanted: what the compiled model is to say of every element.
-        comments: by element, the causes that change it.
-        held: the causes that are in it.
-        said: what it cannot hold, and how what it holds differs, one line each.
+        robot: the robot, with joints in series if causes add some.
+        text: the model as MJCF written by MuJoCo.
+        model: the compiled model.
+        wanted: target fields of the compiled model.
+        comments: causes that change an element, by element.
+        held: causes that the model contains.
+        said: notes about causes that it cannot contain, and about differences of those it contains.
     """
 
     robot: Robot
@@ -91,16 +91,16 @@ class Applied:
 
 
 def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: str = "") -> Applied:
-    """The robot's model with causes in it.
+    """Apply causes to a robot's model.
 
     Args:
-        robot: what was read; it stays as it is.
+        robot: robot as read from its model file; it is not changed.
         causes: coefficients by ``effect@place``, ``effect@*`` or ``effect``.
-        recording: to which they were fitted; comments name it.
+        recording: title of the recording to which they were fitted, for comments.
 
     Raises:
-        InputError: a place that the robot does not have.
-        RuntimeError: the model does not take a change; a fault of the program.
+        InputError: the robot has no place of that name.
+        RuntimeError: the model does not accept a change; this is a program error.
     """
     found = one_by_one(robot, causes)
     said = []
@@ -114,7 +114,7 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
     wanted = fields(robot.compiled)
     comments: dict[Element, list[str]] = {}
     held: list[Cause] = []
-    # What is in series takes its part of the armatures that there are.
+    # Elements in series take their share of armatures, so they are written last.
     for cause in sorted(found, key=lambda c: (order(c), _is_in_series(c))):
         before = {name: values.copy() for name, values in wanted.items()}
         done = {one.place for one in held if _is_in_series(one)}
@@ -138,10 +138,11 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
                 comments.setdefault(element, []).append(cause.told(recording))
     spec, model = _compiled(robot, wanted)
     if any(gives(made)[0] for made in series.values()):
-        # What a limit takes for a spring hangs on all that acts.
+        # The solver parameters of compliant flanks depend on all causes, so they are computed
+        # again.
         robot = with_flanks(robot, series, model)
         spec, model = _compiled(robot, wanted)
-    # The text alone: a compiled spec holds all meshes a second time.
+    # Only the text is stored, since a compiled spec holds all meshes a second time.
     text = saved(spec, robot.path.resolve().parent)
     del spec
     release_free_memory()
@@ -149,7 +150,7 @@ def apply(robot: Robot, causes: Mapping[str, Mapping[str, Number]], recording: s
 
 
 def _note(robot: Robot, cause: Cause) -> str | None:
-    """What is to be known of an effect that the file holds; None where there is nothing."""
+    """Return the note about an effect that the file contains; None if there is none."""
     if cause.effect == COULOMB and (robot.friction_form == "soft" or cause.coefficients[0] < 0):
         return _SOFT
     return _NOTES.get(cause.effect)
@@ -160,7 +161,7 @@ def _is_in_series(cause: Cause) -> bool:
 
 
 def _in_series(causes: Sequence[Cause]) -> dict[str, Transmission]:
-    """What causes put in series with joints, by their names."""
+    """Combine the elements that causes put in series with joints, by joint."""
     elements: dict[str, list[Transmission]] = {}
     for cause in causes:
         if _is_in_series(cause):
@@ -176,8 +177,8 @@ def _element(cause: Cause) -> Transmission:
 def _write(
     wanted: Fields, robot: Robot, cause: Cause, series: Mapping[str, Transmission]
 ) -> str | None:
-    """Let a cause change the fields; those in `series` are still to be written."""
-    # A coupling is an element of its own, which the robot has by now.
+    """Apply a cause to the fields; `series` contains the elements in series not yet written."""
+    # A coupling is an element of the robot, which has been added before.
     if cause.effect == COUPLED:
         return None
     if is_gravity_compensated(cause.effect, cause.numbers):
@@ -199,7 +200,7 @@ def _write(
 
 
 def _compiled(robot: Robot, wanted: Fields) -> tuple[Any, Any]:
-    """A spec that compiles to what is wanted, and the compiled model."""
+    """Return a spec that compiles to the wanted fields, and the compiled model."""
     spec, model = robot.spec.copy(), robot.compiled
     by_id = Elements(spec, robot)
     tolerance = 0.0
@@ -219,7 +220,7 @@ def _compiled(robot: Robot, wanted: Fields) -> tuple[Any, Any]:
 
 
 def _keep_masses(spec: Any, wanted: Fields) -> None:
-    """Let the compiler take inertials as they are stated."""
+    """Change compiler settings so that MuJoCo uses inertials as specified."""
     import mujoco
 
     if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
@@ -233,7 +234,7 @@ class Elements:
 
     def __init__(self, spec: Any, robot: Robot) -> None:
         self.spec = spec
-        # Numbers are known once it has been compiled.
+        # Elements have numbers only after compilation.
         spec.compile()
         self.joints = {joint.id: joint for joint in spec.joints}
         self.bodies = {body.id: body for body in spec.bodies}
@@ -241,7 +242,7 @@ class Elements:
         self.robot = robot
 
     def of(self, element: Element) -> Any:
-        """The spec's element."""
+        """Return the spec's element for an element of the compiled model."""
         if element.kind == "option":
             return self.spec.option
         of_kind = {"joint": self.joints, "actuator": self.actuators}
@@ -249,7 +250,12 @@ class Elements:
 
 
 def state(element: Any, statement: Statement) -> None:
-    """Set in an element of a spec what a statement says."""
+    """Set the attributes of a statement in an element of a spec.
+
+    Args:
+        element: element of a mujoco.MjSpec; it is changed in place.
+        statement: attributes in MuJoCo's units.
+    """
     import mujoco
 
     kind = statement.element.kind
@@ -272,7 +278,7 @@ def state(element: Any, statement: Statement) -> None:
 
 
 def _numbers(element: Any, name: str, attribute: str, values: Sequence[float]) -> Any:
-    """Values as the spec takes them: one number, or an array of the length that it has."""
+    """Convert values to the form of a spec attribute: a number, or an array of its length."""
     import mujoco
 
     if name == "springref" and element.type == mujoco.mjtJoint.mjJNT_HINGE:
@@ -286,7 +292,7 @@ def _numbers(element: Any, name: str, attribute: str, values: Sequence[float]) -
 
 
 def _explicit(body: Any) -> None:
-    """Let the inertial that was set be the one that counts."""
+    """Make the compiler use the inertial that was set."""
     import mujoco
 
     body.explicitinertial = True

@@ -1,6 +1,4 @@
-"""Files that were written for a robot, loaded again: the numbers of their models and their motion
-are those that were meant.
-"""
+"""Reload written model files, and compare their numbers and motion with the intended model."""
 
 from __future__ import annotations
 
@@ -21,28 +19,28 @@ from sims.robot.quiet import quiet
 from sims.robot.writing import SAME, Causes, Written
 
 NEAR = 1e-9
-"""rad and m by which two motions may differ."""
+"""Tolerance between the positions of two motions, in rad or m (absolute) and relative."""
 
 SECONDS = 1.0
-"""Of motion that is compared."""
+"""Duration of the compared motion, in seconds."""
 
 MOST = 2000
-"""Steps of it, at most."""
+"""Maximum number of steps of the compared motion."""
 
 _OF_URDF = ("body_mass", "body_ipos", "dof_damping", "dof_frictionloss")
-"""Fields that a URDF states, beside tensors of inertia."""
+"""Model fields that a URDF specifies, in addition to the inertia tensors."""
 
 
 def check(robot: Robot, causes: Causes, done: Written) -> None:
-    """Load each file again, from a folder of its own, and compare it.
+    """Reload each written file from a temporary folder, and compare it with the intended model.
 
     Args:
-        robot: what was read.
-        causes: what was written.
-        done: the files.
+        robot: robot as read from its model file.
+        causes: causes that were written.
+        done: the written files.
 
     Raises:
-        RuntimeError: a number or the motion differs; names the field. A fault of the program.
+        RuntimeError: a number or the motion differs; names the field. This is a program error.
     """
     with tempfile.TemporaryDirectory() as folder:
         if done.xml is not None:
@@ -57,7 +55,7 @@ def check(robot: Robot, causes: Causes, done: Written) -> None:
 
 
 def _check_mjcf(done: Written, path: Path) -> None:
-    """Compare what the MJCF says with the model that was meant."""
+    """Compare a written MJCF with the intended model."""
     import mujoco
 
     with quiet():
@@ -66,7 +64,7 @@ def _check_mjcf(done: Written, path: Path) -> None:
 
 
 def _check_urdf(robot: Robot, causes: Causes, path: Path) -> None:
-    """Compare what the URDF says with the causes that it holds."""
+    """Compare a written URDF with the model file with the causes that a URDF can contain."""
     from sims.robot.reading import read
     from sims.robot.urdf_out import UrdfWriter
 
@@ -79,12 +77,13 @@ def _check_urdf(robot: Robot, causes: Causes, path: Path) -> None:
         one, other = getattr(found, name), getattr(wanted, name)
         if one.shape != other.shape or not np.allclose(one, other, rtol=SAME, atol=SAME):
             raise RuntimeError(f"extended.urdf is not as it was meant: {name}")
-    # Where two moments are alike their axes are anybody's: the whole tensor counts.
+    # The axes of two equal moments are arbitrary, so whole tensors are compared.
     one, other = _tensors(found), _tensors(wanted)
     if not np.allclose(one, other, rtol=SAME, atol=max(NEAR * np.abs(other).max(), LEAST)):
         raise RuntimeError("extended.urdf is not as it was meant: body_inertia")
     for model in (wanted, found):
-        # URDF says nothing of how stiff friction is, and what touches may be a mesh elsewhere.
+        # A URDF does not specify the stiffness of friction, and colliding shapes may be meshes
+        # elsewhere.
         _without_contacts(model)
         for name in ("dof_solref", "dof_solimp", "body_inertia", "body_iquat"):
             getattr(model, name)[:] = getattr(found, name)
@@ -92,7 +91,7 @@ def _check_urdf(robot: Robot, causes: Causes, path: Path) -> None:
 
 
 def _tensors(model: Any) -> Array:
-    """(N, 3, 3) of the bodies, about their centres, in their axes."""
+    """Compute inertia tensors (N, 3, 3) about the centres of mass, in the axes of the bodies."""
     import mujoco
 
     turns = np.zeros((model.nbody, 9))
@@ -124,12 +123,12 @@ def _compare_motion(found: Any, wanted: Any, name: str) -> None:
 
 
 def moved(model: Any) -> Array:
-    """(S, nq) motion of a model from a pose beside its own, with controls that are not zero."""
+    """Simulate a test motion (S, nq) from a displaced pose with nonzero controls."""
     import mujoco
     from mujoco import rollout
 
     data = mujoco.MjData(model)
-    # No two coordinates alike, so that a swap would show.
+    # All coordinates get different values, so that swapped coordinates are detected.
     mujoco.mj_integratePos(model, data.qpos, 0.1 + 0.05 * np.sin(np.arange(model.nv)), 1.0)
     low, high = model.actuator_ctrlrange.T
     middle, half = (low + high) / 2.0, (high - low) / 2.0

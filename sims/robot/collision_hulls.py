@@ -1,13 +1,13 @@
-"""Convex hulls of collision meshes: all that MuJoCo's contacts need of a mesh.
+"""Convex hulls of collision meshes, which contain all mesh data that MuJoCo's contacts need.
 
 A compiled mesh consists of vertices, faces, normals and a bounding volume hierarchy of its faces.
-Contacts of convex geoms read the vertices of the convex hull, the graph of the hull's edges and its
-polygons alone (MuJoCo's documentation, "Computation", collision detection); the rest, nine tenths
-of the memory, serves rendering, rays and signed distances.
+Contacts of convex geoms only read the vertices of the convex hull, the graph of the hull's edges
+and its polygons (MuJoCo's documentation, "Computation", collision detection). The rest, nine tenths
+of the memory, is for rendering, rays and signed distances.
 
 MuJoCo's compiler would compute another hull from rounded vertices, and contacts would differ in
 their eighth digit. So the graph, the polygons and the bounds of the original mesh are copied into
-each model that is compiled, and contacts are equal to the last bit.
+each compiled model, and contacts are bitwise equal.
 """
 
 from __future__ import annotations
@@ -22,37 +22,39 @@ from numpy.typing import NDArray
 from sims.base import Array
 
 MIN_FACES = 200
-"""Number of faces below which replacing a mesh by its hull saves no memory worth the work."""
+"""Minimum number of faces of a mesh that is replaced by its hull to save memory."""
 CORE = 2.0**-6
-"""Size of the box inside a hull that stands for its faces, as a share of the hull's half sizes."""
+"""Size of the box inside a hull that replaces its faces, as a share of the hull's half sizes."""
 CORE_FACES = (
     (0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
 )  # fmt: skip
 """Triangles of a box whose corners are numbered by the signs of x, y and z."""
 RESERVE = "simgap.reserve"
-"""Beginning of the names of meshes that make room for hulls that are copied into a model."""
+"""Prefix of the names of meshes that reserve memory for hulls that are copied into a model."""
 LARGEST = ("npolygonmax", "nmeshdegmax")
-"""Sizes of a model by which MuJoCo reserves buffers: most corners of a polygon, and most polygons
-at a vertex.
+"""Size fields by which MuJoCo allocates buffers.
+
+They are the maximum number of corners of a polygon, and of polygons at a vertex.
 """
 TESTED = "4.0."
-"""Beginning of the versions of MuJoCo whose compiled meshes are known to be what `write_hulls`
-writes; with others, meshes that collide stay as they are.
+"""Version prefix of MuJoCo whose compiled meshes have the layout that `write_hulls` writes.
+
+With other versions, colliding meshes are kept unchanged.
 """
 
 MEASURED = ("geom_size", "geom_aabb", "geom_rbound")
-"""Fields of a geom that MuJoCo computes from vertices before it rounds them to single precision."""
+"""Geom fields that MuJoCo computes from vertices before it rounds them to single precision."""
 
 Integers = NDArray[np.int32]
 
 
 class Lists(NamedTuple):
-    """Lists of integers one behind the other in one array.
+    """Lists of integers, concatenated in one array.
 
     Attributes:
-        values: all of them.
-        sizes: of each list.
+        values: all values.
+        sizes: size of each list.
     """
 
     values: Integers
@@ -65,11 +67,11 @@ class Hull:
 
     Attributes:
         vertices: (V, 3) float32, in the mesh's own frame.
-        graph: MuJoCo's `mesh_graph` of it; vertices are numbered from 0 to V - 1.
-        normals: (P, 3) of its polygons.
-        polygons: the vertices of each polygon.
-        around: the polygons around each vertex.
-        extrema: (27,) where the search for the furthest vertex in a direction begins.
+        graph: MuJoCo's `mesh_graph` of the hull; vertices are numbered from 0 to V - 1.
+        normals: (P, 3) normals of its polygons.
+        polygons: vertices of each polygon.
+        around: polygons around each vertex.
+        extrema: (27,) start vertices of the search for the furthest vertex in a direction.
     """
 
     vertices: NDArray[np.float32]
@@ -85,11 +87,11 @@ def read_hull(model: Any, mesh: int, whole: bool = False) -> Hull | None:
 
     Args:
         model: the mujoco.MjModel.
-        mesh: its number.
-        whole: keep vertices that are not on the hull, and the numbers of all.
+        mesh: number of the mesh.
+        whole: keep vertices that are not on the hull, and the numbers of all vertices.
 
     Returns:
-        The hull; None where the mesh has none, as no geom with it collides.
+        The hull; None if the mesh has none, since no geom with it collides.
     """
     begin = int(model.mesh_graphadr[mesh])
     if begin < 0:
@@ -97,7 +99,7 @@ def read_hull(model: Any, mesh: int, whole: bool = False) -> Hull | None:
     count, faces = model.mesh_graph[begin : begin + 2].tolist()
     graph: Integers = model.mesh_graph[begin : begin + 2 + 3 * count + 6 * faces].copy()
     every = np.arange(model.mesh_vertnum[mesh], dtype=np.int32)
-    # In their own order, as MuJoCo may compare the numbers of two vertices.
+    # The vertices keep their order, as MuJoCo may compare the numbers of two vertices.
     ids = every if whole else np.sort(graph[2 + count : 2 + 2 * count])
     new = np.full(every.size, -1, dtype=np.int32)
     new[ids] = np.arange(ids.size)
@@ -121,12 +123,12 @@ def read_hull(model: Any, mesh: int, whole: bool = False) -> Hull | None:
 
 @dataclass(frozen=True, eq=False)
 class CollisionShapes:
-    """What models that are compiled of hulls take from the model with the whole meshes.
+    """Data that models compiled from hulls copy from the model with the whole meshes.
 
     Attributes:
-        hulls: by the name of the mesh.
+        hulls: hulls by name of the mesh.
         geoms: fields of geoms that have such a mesh, by the geom's name and the field.
-        bounds: (N, 6) `bvh_aabb` of the bounding volume hierarchies of bodies, by their numbers.
+        bounds: (N, 6) `bvh_aabb` of the bounding volume hierarchies of bodies, by body number.
     """
 
     hulls: Mapping[str, Hull]
@@ -135,12 +137,12 @@ class CollisionShapes:
 
     @classmethod
     def read(cls, model: Any, hulls: Mapping[str, Hull], geoms: Mapping[str, int]) -> Self:
-        """Read what is needed of the model with the whole meshes.
+        """Read the data from the model with the whole meshes.
 
         Args:
-            model: that one.
-            hulls: as the attribute.
-            geoms: numbers of the geoms in that model, by their names.
+            model: model with the whole meshes.
+            hulls: hulls by name of the mesh.
+            geoms: numbers of the geoms in that model, by geom name.
         """
         fields = {
             name: {field: getattr(model, field)[i].copy() for field in MEASURED}
@@ -150,20 +152,21 @@ class CollisionShapes:
         return cls(hulls, fields, {body: _bounds(model, body).copy() for body in bodies})
 
     def write(self, model: Any) -> None:
-        """Write it into a compiled model whose spec has meshes of `add_hull` and `add_reserve`."""
+        """Write the data into a model compiled with meshes of `add_hull` and `add_reserve`."""
         write_hulls(model, self.hulls)
         for name, fields in self.geoms.items():
             for field, values in fields.items():
                 getattr(model, field)[model.geom(name).id] = values
         for body, bounds in self.bounds.items():
             there = _bounds(model, body)
-            # Fewer, where geoms that cannot touch anything are left out: its own are as good.
+            # The numbers of bounds differ if geoms that cannot collide were removed; then the
+            # compiler's own bounds are equally valid.
             if there.shape == bounds.shape:
                 there[:] = bounds
 
 
 def _bounds(model: Any, body: int) -> Array:
-    """(N, 6) the bounding volumes of a body, a view into the model."""
+    """Return the bounding volumes (N, 6) of a body, as a view into the model."""
     first = int(model.body_bvhadr[body])
     view: Array = model.bvh_aabb[first : first + int(model.body_bvhnum[body])]
     return view
@@ -172,13 +175,18 @@ def _bounds(model: Any, body: int) -> Array:
 def add_hull(spec: Any, name: str, hull: Hull) -> None:
     """Add a mesh to a spec that compiles to the hull's vertices in the hull's frame.
 
-    MuJoCo moves a mesh into the principal frame of its faces. These are those of a small box about
-    the origin, whose frame is the hull's, so that no vertex moves.
+    MuJoCo moves a mesh into the principal frame of its faces. The added faces are those of a small
+    box around the origin, whose frame is the hull's, so that no vertex moves.
+
+    Args:
+        spec: the mujoco.MjSpec; it is changed in place.
+        name: name of the mesh.
+        hull: hull to add.
     """
     import mujoco
 
     half = float(np.abs(hull.vertices).max()) * CORE
-    # The principal moments have to descend from x to z, or the axes would be exchanged.
+    # The principal moments must decrease from x to z, else MuJoCo would exchange the axes.
     sides = 2.0 ** np.floor(np.log2(half)) * np.array([0.25, 0.5, 1.0])
     signs = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
     vertices = np.concatenate([hull.vertices.astype(float), sides * np.array(signs)])
@@ -188,26 +196,26 @@ def add_hull(spec: Any, name: str, hull: Hull) -> None:
 
 
 def add_reserve(spec: Any, model: Any, whole: Any, hulls: Mapping[str, Hull]) -> None:
-    """Add meshes that make room in compiled models for `write_hulls`, where there is too little.
+    """Add meshes that reserve memory for `write_hulls` in compiled models, if there is too little.
 
     Args:
-        spec: with the meshes of `add_hull`.
-        model: that is compiled of it.
-        whole: the model with the whole meshes.
-        hulls: by the name of the mesh.
+        spec: the mujoco.MjSpec with the meshes of `add_hull`; it is changed in place.
+        model: model compiled from `spec`.
+        whole: model with the whole meshes.
+        hulls: hulls by name of the mesh.
     """
     found = [read_hull(model, model.mesh(name).id) for name in hulls]
     lacking = _sizes(hulls.values()) - _sizes(hull for hull in found if hull)
     if lacking.max() > 0:
         # A hull of n vertices in general position has 2 n - 4 triangles, and so 15 n - 22 integers
-        # in its graph, 2 n - 4 polygons and 6 n - 12 corners; MuJoCo merges some of them.
+        # in its graph, 2 n - 4 polygons and 6 n - 12 corners. MuJoCo merges some of them.
         count = int(1.5 * np.max(lacking / (15, 2, 6))) + 8
         height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
         x, y = np.sqrt(1.0 - height**2) * _turns(np.arange(count) * np.pi * (3.0 - np.sqrt(5.0)))
         sphere = np.stack([x, y, height], axis=1)
         spec.add_mesh(name=f"{RESERVE}.sphere", uservert=sphere.ravel())
     if any(getattr(model, size) < getattr(whole, size) for size in LARGEST):
-        # The base of a pyramid is a polygon with as many corners as there are sides at its top.
+        # The base of a pyramid is a polygon with as many corners as the apex has sides.
         count = 8 + max(getattr(whole, size) for size in LARGEST)
         x, y = _turns(2.0 * np.pi * np.arange(count) / count)
         base = np.stack([x, y, np.zeros(count)], axis=1)
@@ -216,27 +224,32 @@ def add_reserve(spec: Any, model: Any, whole: Any, hulls: Mapping[str, Hull]) ->
 
 
 def _turns(angles: Array) -> Array:
-    """(2, n) cosines and sines."""
+    """Return cosines and sines, (2, n)."""
     return np.stack([np.cos(angles), np.sin(angles)])
 
 
 def has_room(model: Any, whole: Any) -> bool:
-    """Whether the buffers that MuJoCo reserves for contacts of a model are as large as those for
-    the model with the whole meshes; without room it would write beyond them.
+    """Return whether MuJoCo's contact buffers for a model are at least those for the whole meshes.
+
+    With smaller buffers MuJoCo would write beyond their ends.
+
+    Args:
+        model: model with hulls.
+        whole: model with the whole meshes.
     """
     sizes = [name for name in dir(whole) if name.startswith("n") and name.endswith("max")]
     return all(getattr(model, name) >= getattr(whole, name) for name in sizes)
 
 
 def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
-    """Put hulls in the place of those that MuJoCo's compiler has found.
+    """Replace the hulls that MuJoCo's compiler has computed.
 
     Args:
-        model: a compiled spec with meshes of `add_hull` and `add_reserve`.
-        hulls: by the name of the mesh.
+        model: model compiled from a spec with meshes of `add_hull` and `add_reserve`.
+        hulls: hulls by name of the mesh.
     """
     names = [model.mesh(i).name for i in range(model.nmesh)]
-    # All are read before the first is written, since they move within MuJoCo's arrays.
+    # All hulls are read before the first is written, since they move within MuJoCo's arrays.
     wanted = [hulls.get(name) or read_hull(model, i, whole=True) for i, name in enumerate(names)]
     graph = polygon = corner = mapped = 0
     for i, (name, hull) in enumerate(zip(names, wanted, strict=True)):
@@ -262,21 +275,21 @@ def write_hulls(model: Any, hulls: Mapping[str, Hull]) -> None:
 
 
 def _sizes(hulls: Iterable[Hull]) -> Array:
-    """(3,) integers of graphs, number of polygons and number of their corners, of all together."""
+    """Return the total numbers (3,) of graph integers, polygons and polygon corners of hulls."""
     sizes = [(h.graph.size, h.polygons.sizes.size, h.polygons.values.size) for h in hulls]
     total: Array = np.sum(np.array(sizes, dtype=float).reshape(-1, 3), axis=0)
     return total
 
 
 def _gather(values: Integers, begins: Integers, sizes: Integers) -> Lists:
-    """Copy the lists that begin at these places of an array."""
+    """Copy lists out of an array, given their begins and sizes."""
     ends = np.cumsum(sizes)
     places = np.repeat(begins - ends + sizes, sizes) + np.arange(ends[-1] if ends.size else 0)
     return Lists(values[places], sizes.copy())
 
 
 def _put(values: Integers, begins: Integers, sizes: Integers, lists: Lists, first: int) -> int:
-    """Write lists into an array from a place on, and where they begin; returns where they end."""
+    """Write lists into an array from index `first` on; return the end index."""
     ends = first + np.cumsum(lists.sizes)
     begins[:], sizes[:] = ends - lists.sizes, lists.sizes
     values[first : first + lists.values.size] = lists.values

@@ -1,14 +1,13 @@
-"""What lies between a command and its actuator, and a constant force, as fields of a compiled
-model.
+"""Input effects and constant forces as fields of a compiled model.
 
-With u the command, w = clip((1 + a) u + b, -s, s) what the actuator takes, [l, h] its control
-range, and force = g w + bias:
+With the command u, the actuator input w = clip((1 + a) u + b, -s, s), the control range [l, h] of
+the actuator, and force = g w + bias:
 
 * (1) force = g (1 + a) v + g b + bias, with
-* (2) v = clip(u, ...) between ((L - b) / (1 + a), (H - b) / (1 + a)), [L, H] what -s ... s and the
-  control range have in common
+* (2) v = clip(u, ...) between ((L - b) / (1 + a), (H - b) / (1 + a)), where [L, H] is the
+  intersection of [-s, s] and the control range
 
-so gain, bias and saturation are MuJoCo's own gain, bias and control range.
+so gain, bias and saturation become MuJoCo's gain, bias and control range.
 """
 
 from __future__ import annotations
@@ -24,14 +23,17 @@ from sims.robot.model import Robot
 from sims.robot.stated import Fields
 
 Answer = str | None
-"""Why a cause cannot be stated; None where it is. After a ``+``, what is to be known of it then."""
+"""Reason why a cause cannot be written; None if it is written.
+
+A text that begins with ``+`` is a note about a cause that is written.
+"""
 
 LIMIT = 1e-12
-"""The least 1 + a: a command cannot be turned round by an error of its gain."""
+"""Minimum factor 1 + a, since a gain error cannot reverse the sign of a command."""
 
 
 class _Actuator:
-    """The fields of one actuator, and what it is."""
+    """The fields of one actuator, and its properties."""
 
     def __init__(self, fields: Fields, robot: Robot, place: str) -> None:
         import mujoco
@@ -45,7 +47,7 @@ class _Actuator:
         self.fixed = self._of("actuator_gaintype") == int(mujoco.mjtGain.mjGAIN_FIXED)
         self.gain = fields["actuator_gainprm"][0, self.id]
         self.bias = fields["actuator_biasprm"][0, self.id]
-        # 1 + a and b of (1), of the causes that are in the fields already.
+        # The factor 1 + a and the offset b of (1) from causes that are in the fields already.
         self.command = fields.setdefault("command", _commands(robot))[0, self.id]
 
     def _of(self, name: str) -> int:
@@ -53,12 +55,12 @@ class _Actuator:
 
     @property
     def linear(self) -> bool:
-        """Whether its force is its control, perhaps filtered, times a gain, plus a bias."""
+        """Whether the force is a gain times one control (possibly filtered) plus a bias."""
         return self.single and (self.direct or self.filtered) and self.fixed and self.steady
 
     @property
     def steady(self) -> bool:
-        """Whether its bias has a constant, or may be given one."""
+        """Whether the bias has a constant term, or can be given one."""
         import mujoco
 
         kinds = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
@@ -66,38 +68,38 @@ class _Actuator:
 
     @property
     def filtered(self) -> bool:
-        """Whether a linear filter without limits stands before it."""
+        """Whether a linear filter without limits precedes the actuator."""
         import mujoco
 
         kinds = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
         return self._of("actuator_dyntype") in kinds and not self.clamped
 
     def shift(self, force: float) -> None:
-        """Add a constant to its force."""
+        """Add a constant to the force."""
         import mujoco
 
         if self._of("actuator_biastype") == int(mujoco.mjtBias.mjBIAS_NONE):
-            # What stands in the file without a kind of bias is not in use.
+            # Bias parameters of an actuator without a bias type have no effect.
             self.bias[:] = 0.0
             self.fields["actuator_biastype"][0, self.id] = int(mujoco.mjtBias.mjBIAS_AFFINE)
         self.bias[0] += force
 
     def limits(self) -> tuple[float, float]:
-        """Of its control."""
+        """Return the lower and upper limit of the control."""
         if not self.fields["actuator_ctrllimited"][0, self.control]:
             return -np.inf, np.inf
         low, high = self.fields["actuator_ctrlrange"][0, self.control]
         return float(low), float(high)
 
     def limit(self, low: float, high: float) -> None:
-        """Set the limits of its control; infinite ones are none."""
+        """Set the limits of the control; infinite limits are ignored."""
         if np.isfinite(low) and np.isfinite(high):
             self.fields["actuator_ctrllimited"][0, self.control] = True
             self.fields["actuator_ctrlrange"][0, self.control] = (low, high)
 
 
 def _commands(robot: Robot) -> Any:
-    """(1, N, 2) the commands as they are given."""
+    """Return the unchanged factor and offset (1, N, 2) of each actuator's command."""
     return np.array([[(1.0, 0.0)] * len(robot.compiled.actuator_ctrlnum)])
 
 
@@ -155,8 +157,8 @@ def _delay(fields: Fields, robot: Robot, cause: Cause) -> Answer:
     if fields["actuator_delay"][0, actuator.id] > 0:
         return "the file states a delay already"
     fields["actuator_delay"][0, actuator.id] = delay
-    # Between two controls of the past it is linear: the mean, over the step, of controls that are
-    # held over their steps.
+    # MuJoCo interpolates linearly between past controls. This equals the mean, over a step, of
+    # delayed controls that are constant over their steps.
     fields["actuator_history"][0, actuator.id] = (ceil(delay / step) + 1, 1)
     late = "" if delay >= step else f", delays it by a whole step, {step:g} s"
     return (
@@ -184,7 +186,7 @@ def _lag(fields: Fields, robot: Robot, cause: Cause) -> Answer:
 
 
 def _force(fields: Fields, robot: Robot, cause: Cause) -> Answer:
-    """A constant force at a joint: its spring rests elsewhere, or its actuator has a bias."""
+    """Write a constant force at a joint, as a spring rest position or an actuator bias."""
     joint, (force,) = robot.joint(cause.place), cause.coefficients
     stiffness = fields["jnt_stiffness"][0, joint.id]
     stated = robot.compiled.ntendon - len(robot.coupled)
@@ -228,14 +230,16 @@ COMMANDS: Mapping[str, Command] = {
     "input.lag": _lag,
     "force.bias": _force,
 }
-"""By effect, in the order in which a command passes them; what changes the model first."""
+"""Writers by effect: model changes, then effects in the order in which a command passes them."""
 
 
 def order(cause: Cause) -> Any:
-    """How it is stepped first, then what stands in the model, then commands in the order in which
-    a signal passes them.
+    """Return the sort key of a cause in the order of application.
+
+    Integrator settings come first, then causes in the model, then input effects in the order in
+    which a command passes them.
     """
-    # How stiff friction is hangs on the step.
+    # The stiffness of dry friction depends on the time step.
     if cause.effect.startswith("numerics."):
         return -2
     names = list(COMMANDS)

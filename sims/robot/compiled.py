@@ -1,9 +1,9 @@
-"""Forces of effects on lanes of a robot as one program, which the compiled engine runs.
+"""Effect forces on a batch of robots by a compiled program.
 
-numpy asks effect by effect and takes longer than MuJoCo takes for the step. What effects compute is
-traced once, as for the systems of `sims.engines.compiled`, and written as instructions on
-registers, a column for each lane. Effects that do not trace, or that give other numbers then, are
-asked by numpy as ever.
+With numpy, each effect is evaluated separately, which takes longer than MuJoCo's step. Here the
+computation of the effects is traced once, as for the systems of `sims.engines.compiled`, and
+written as instructions on registers with one column for each batch element. Effects that cannot be
+traced, or that give other numbers then, are evaluated with numpy.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from sims.robot.system import RobotSystem
 from sims.system import Effect, Hidden, State
 
 TOLERANCE = 1e-9
-"""Share of the largest number by which a program may differ from what it was traced from."""
+"""Maximum deviation of a program from its source, as a share of the largest number."""
 INSTANTS = 16
-"""At which it is compared."""
+"""Maximum number of times at which a program is compared with its source."""
 KEPT = 500
-"""Programs of a robot that are kept."""
+"""Maximum number of cached programs for one robot and set of inputs."""
 
 
 class _Asked(NamedTuple):
-    """An effect as it is traced.
+    """An effect prepared for tracing.
 
     Attributes:
-        effect: itself.
-        c: (K, 1, 1) its coefficients.
-        state: of an effect that has one.
+        effect: the effect.
+        c: (K, 1, 1) traced coefficients.
+        state: traced hidden state; None for effects without one.
     """
 
     effect: Effect
@@ -50,15 +50,15 @@ class _Asked(NamedTuple):
 
 
 class _Program(NamedTuple):
-    """What effects exert, as instructions.
+    """Forces of effects as instructions.
 
     Attributes:
-        written: them, on groups of registers: time at the beginning of a step and in its middle,
-            the step, the seconds that states go on, what is seen, inputs, stiffness, coefficients,
-            states.
+        written: instructions on groups of registers: time at the beginning and at the middle of a
+            step, step length, integration interval of hidden states, motion, inputs, stiffness,
+            coefficients, hidden states.
         force: (D,) registers of the forces.
-        limit: (D,) of the limits of dry friction.
-        states: (2 H,) of the states after the step.
+        limit: (D,) registers of the limits of dry friction.
+        states: (2 H,) registers of the hidden states after the step.
     """
 
     written: Written
@@ -68,11 +68,11 @@ class _Program(NamedTuple):
 
 
 class _Tracing:
-    """A robot's instant, and the effects that are asked for at it.
+    """Traced state of a robot, and programs of the effects that are evaluated at it.
 
     Args:
-        system: the robot's.
-        inputs: their names.
+        system: system of the robot.
+        inputs: names of the inputs.
     """
 
     def __init__(self, system: RobotSystem, inputs: tuple[str, ...]) -> None:
@@ -96,10 +96,10 @@ class _Tracing:
         self.known: dict[type[Effect], bool] = {}
 
     def program(self, effects: Sequence[Sequence[Effect]]) -> _Program:
-        """What these effects exert: those that push, those that rub, those with states.
+        """Return the program for forces, frictions and effects with hidden states.
 
         Raises:
-            UntracedError: one cannot be traced, or there are too many.
+            UntracedError: an effect cannot be traced, or there are too many effects.
         """
         key = tuple(type(effect) for group in effects for effect in group)
         if key not in self._programs:
@@ -114,7 +114,8 @@ class _Tracing:
         for group in effects:
             asked.append([])
             for effect in group:
-                # One that acts alone acts in a family besides, in other lanes.
+                # An effect may occur twice: alone, and as a member of a family in other batch
+                # elements.
                 asked[-1].append(self._of(effect, before[type(effect)]))
                 before[type(effect)] += 1
         forces, frictions, hidden = ([(one.effect, one.c) for one in group] for group in asked)
@@ -144,7 +145,7 @@ class _Tracing:
         return _Program(written, places[0], places[1], after_all)
 
     def _of(self, effect: Effect, number: int) -> _Asked:
-        """An effect, for the first time in a program or once more."""
+        """Return the traced form of an effect, for its given occurrence in a program."""
         kind = type(effect), number
         if kind not in self._asked:
             if getattr(effect, "__dict__", None):
@@ -158,24 +159,24 @@ class _Tracing:
 
     @staticmethod
     def _nodes(values: Any) -> list[Any]:
-        """Nodes of what is traced; a state may have come out as another shape."""
+        """Return the nodes of a traced value; the shape of a hidden state may have changed."""
         if not hasattr(values, "nodes"):
             raise UntracedError("it gives numbers that hang on nothing")
         return nodes_of(values)
 
 
 class CompiledForces:
-    """As `sims.robot.forces.Forces`, by a program.
+    """Effect forces computed by a program, with the interface of `sims.robot.forces.Forces`.
 
     Attributes:
-        rubs: see there.
-        addresses: see there.
-        loaded: see there.
+        rubs: as in `Forces`.
+        addresses: as in `Forces`.
+        loaded: as in `Forces`.
 
     Args:
-        forces: what is asked for.
-        program: of it.
-        run_by: the compiled functions.
+        forces: effects to evaluate.
+        program: program of these effects.
+        run_by: functions that execute programs.
     """
 
     def __init__(self, forces: Forces, program: _Program, run_by: Machine) -> None:
@@ -203,11 +204,11 @@ class CompiledForces:
 
     @cached_property
     def _felt(self) -> Array:
-        """(S, U, L)."""
+        """Applied inputs (S, U, L)."""
         return np.ascontiguousarray(np.stack(list(self._of.felt.values())).transpose(2, 0, 1))
 
     def at(self, k: int, look: Look) -> tuple[Array, Array]:
-        """See `Forces.at`."""
+        """Compute forces and friction limits over step k, see `Forces.at`."""
         r = self._r
         for rows, values in zip(self._motion, look, strict=True):
             r[rows] = values.T
@@ -230,7 +231,7 @@ class CompiledForces:
 
 
 def compiled(forces: Forces) -> CompiledForces | None:
-    """The same, compiled; None where it does not compile."""
+    """Compile effect forces; return None if an effect cannot be compiled."""
     run_by = machine()
     groups = [[effect for effect, _ in group] for group in _groups(forces)]
     if run_by is None or not any(groups):
@@ -244,19 +245,19 @@ def compiled(forces: Forces) -> CompiledForces | None:
         return None
     try:
         return CompiledForces(forces, tracing.program(groups), run_by)
-    except UntracedError:  # too much at once; nothing is wrong with the effects
+    except UntracedError:  # The program is too large; the effects themselves are valid.
         return None
 
 
 def _compiles(tracing: _Tracing, forces: Forces, effect: Effect, run_by: Machine) -> bool:
-    """Whether an effect does, which is told once where it does not."""
+    """Return whether an effect can be compiled; if not, report it once."""
     kind = type(effect)
     if kind not in tracing.known:
         tracing.known[kind] = False
         try:
             _check(tracing, _alone(forces, effect), run_by)
             tracing.known[kind] = True
-        # Whatever a user's effect raises when it is asked with what is no array.
+        # An effect of a user may raise any exception when it is evaluated with traced values.
         except Exception as reason:
             text = str(reason) or type(reason).__name__
             sys.stderr.write(
@@ -266,10 +267,10 @@ def _compiles(tracing: _Tracing, forces: Forces, effect: Effect, run_by: Machine
 
 
 def _check(tracing: _Tracing, forces: Forces, run_by: Machine) -> None:
-    """See that an effect's program gives what numpy does, on a way that no robot takes.
+    """Compare an effect's program with numpy at random states.
 
     Raises:
-        UntracedError: it does not.
+        UntracedError: the results differ.
     """
     program = tracing.program([[effect for effect, _ in group] for group in _groups(forces)])
     quick = CompiledForces(forces, program, run_by)
@@ -293,6 +294,6 @@ def _effects(forces: Forces) -> list[tuple[Effect, Array]]:
 
 
 def _alone(forces: Forces, effect: Effect) -> Forces:
-    """One of the effects without the others."""
+    """Return the forces of one of the effects only."""
     own = tuple(pair for pair in _effects(forces) if pair[0] is effect)
     return Forces(forces.system, own, forces.felt, forces.addresses, forces.stiffness, forces.step)

@@ -1,5 +1,7 @@
-"""Contacts that a URDF cannot mean: between the fixed base and what hangs on it, and between parts
-that stand within each other; and whether a model can have any.
+"""Exclude contacts that a URDF cannot mean, and find which geoms can collide.
+
+The excluded contacts are those between the fixed base and the bodies attached to it, and those
+between bodies that overlap at the zero position.
 """
 
 from __future__ import annotations
@@ -12,14 +14,21 @@ from numpy.typing import NDArray
 from sims.robot.words import listed
 
 DEEP = 1e-4
-"""m by which shapes overlap at the zero position that are never meant to touch."""
+"""Minimum overlap, in metres, at the zero position of two shapes that are not meant to touch."""
 
 
 def without(spec: Any, model: Any) -> list[str]:
-    """Exclude such contacts from a spec; one line for each kind.
+    """Exclude spurious contacts from a spec.
 
-    MuJoCo leaves out contacts between a body and the one that carries it, but for the world, to
-    which it fuses a URDF's root.
+    MuJoCo itself excludes contacts between a body and its parent, except if the parent is the
+    world; the root of a URDF is fused to the world.
+
+    Args:
+        spec: the mujoco.MjSpec; it is changed in place.
+        model: the compiled model of `spec`.
+
+    Returns:
+        Notes, one for each kind of excluded contact.
     """
     import mujoco
 
@@ -52,33 +61,35 @@ def without(spec: Any, model: Any) -> list[str]:
 
 
 def possible(model: Any) -> bool:
-    """Whether any two shapes of a compiled model may ever touch."""
+    """Return whether any two shapes of a compiled model can collide."""
     return bool(model.nflex or touching(model).any())
 
 
 def touching(model: Any) -> NDArray[np.bool_]:
-    """Find the geoms of a compiled model that may ever touch another one, by MuJoCo's own rules of
-    which pairs are looked at (its documentation, "Computation", collision detection).
+    """Find the geoms of a compiled model that can collide with another geom.
+
+    The pairs are filtered by MuJoCo's own rules (its documentation, "Computation", collision
+    detection).
 
     Args:
         model: the mujoco.MjModel, without flexes.
 
     Returns:
-        (ngeom,) whether each may.
+        (ngeom,) whether each geom can collide.
     """
     import mujoco
 
     weld = np.asarray(model.body_weldid)
     bodies = np.asarray(model.geom_bodyid)
     rows = (bodies, model.geom_contype, model.geom_conaffinity)
-    # many shapes of a body have the same masks
+    # Many geoms of a body have equal masks; equal rows are merged to keep the matrices small.
     (body, kind, affinity), of = np.unique(np.stack(rows), axis=1, return_inverse=True)
     masks = kind[:, None] & affinity
     meet = (masks | masks.T) != 0
     own = weld[body]
     meet &= own[:, None] != own
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
-        # A body and the one that carries it do not touch, but for the world.
+        # MuJoCo excludes contacts between a body and its parent, except if the parent is the world.
         carrier = weld[np.asarray(model.body_parentid)[own]]
         carried = (carrier[:, None] == own) & (own != 0) & (own[:, None] != 0)
         meet &= ~(carried | carried.T)

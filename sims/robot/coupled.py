@@ -1,13 +1,13 @@
-"""Drives that act on two joints: a fixed tendon in place of the joint.
+"""Drives that act on two joints, modelled by a fixed tendon in place of the joint transmission.
 
-With q the position of the drive's own joint, p that of the one before it, c the coefficient and
-U(l, l') what the actuator exerts where its transmission stands at l,
+Let q be the position of the drive's own joint, p that of the preceding joint, c the coefficient,
+and U(l, l') the actuator force at the transmission length l:
 
     l = q + c p,   tau_q = U(l, l'),   tau_p = c U(l, l')                                      (1)
 
-by virtual work, which is MuJoCo's fixed tendon with coefficients 1 and c (documentation,
-"Computation", actuation model): so MuJoCo integrates it as it does any actuator, and a model file
-can say it.
+by virtual work. This is MuJoCo's fixed tendon with coefficients 1 and c (documentation,
+"Computation", actuation model). So MuJoCo integrates it like any actuator, and a model file can
+state it.
 """
 
 from __future__ import annotations
@@ -21,14 +21,21 @@ from sims.robot.quiet import quiet
 
 EFFECT = "joint.coupling"
 ANY = ("", EFFECT)
-"""What stands among what acts in series with joints (`sims.robot.series`) where drives are coupled,
-whichever: one model has a tendon for each, whose c is zero where none is.
+"""Entry for all coupled drives in the list of effects in series (`sims.robot.series`).
+
+One model has a tendon for each drive that can be coupled; c is zero where none is.
 """
 
 
 def before(robot: Robot, name: str) -> Joint | None:
-    """The joint before one, in its own body or in one that carries it; None where that is none of
-    the same kind.
+    """Find the preceding joint, in the joint's own body or in the nearest ancestor with joints.
+
+    Args:
+        robot: robot whose joints are meant.
+        name: joint.
+
+    Returns:
+        The preceding joint; None if there is none or if it is of another kind.
     """
     model, own = robot.compiled, robot.joint(name)
     body = int(model.jnt_bodyid[own.id])
@@ -46,7 +53,7 @@ def before(robot: Robot, name: str) -> Joint | None:
 
 @kept_with_robot
 def places(robot: Robot) -> tuple[str, ...]:
-    """Joints whose drives may be coupled to the joint before."""
+    """List the joints whose drives can be coupled to the preceding joint."""
     driven = {actuator.joint for actuator in robot.actuators}
     return tuple(
         joint.name
@@ -56,15 +63,20 @@ def places(robot: Robot) -> tuple[str, ...]:
 
 
 def named(spec: Any, robot: Robot) -> dict[int, Any]:
-    """Name the joints and actuators of a spec that have no name, as the robot names them: by their
-    numbers, which change where elements are added.
+    """Name the unnamed joints and actuators of a spec as the robot names them.
+
+    Their default names contain their numbers, which change when elements are added.
+
+    Args:
+        spec: the mujoco.MjSpec; it is changed in place.
+        robot: robot that was read from this spec.
 
     Returns:
-        The joints by their numbers.
+        The joints of the spec by their numbers.
     """
     if all(element.name for element in (*spec.joints, *spec.actuators)):
         return {robot.joint(joint.name).id: joint for joint in spec.joints}
-    # Numbers are known once it has been compiled.
+    # Elements have numbers only after compilation.
     with quiet():
         spec.compile()
     joints = {joint.id: joint for joint in spec.joints}
@@ -76,12 +88,11 @@ def named(spec: Any, robot: Robot) -> dict[int, Any]:
 
 
 def coupled(robot: Robot, coefficients: Mapping[str, float]) -> Robot:
-    """The robot with tendons in place of joints; elements keep the names that the robot has for
-    them.
+    """Make a robot with tendons in place of joint transmissions, without changing element names.
 
     Args:
-        robot: that was read.
-        coefficients: c of (1) by joint, of `places`.
+        robot: robot as read from its model file.
+        coefficients: c of (1) by joint; the joints are among `places`.
     """
     import mujoco
 
@@ -98,7 +109,8 @@ def coupled(robot: Robot, coefficients: Mapping[str, float]) -> Robot:
                 actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON
                 actuator.target = tendon.name
                 if actuator.inheritrange > 0:
-                    # The tendon has no range to inherit: the joint's is written down.
+                    # A tendon has no range to inherit, so the control range of the joint is written
+                    # instead.
                     actuator.inheritrange = 0.0
                     actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
                     actuator.ctrlrange = robot.compiled.actuator_ctrlrange[actuator.id]

@@ -1,4 +1,4 @@
-"""A joint with its actuator as a default class of MJCF, and a robot's file that uses it."""
+"""A joint with its actuator as an MJCF default class, and a model file that uses the class."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ _USUAL: Mapping[str, Values] = {
     "solreffriction": (0.02, 1.0),
     "solimpfriction": (0.9, 0.95, 0.001, 0.5, 2.0),
 }
-"""What MuJoCo takes where nothing is stated; zero for all others."""
+"""MuJoCo's default values of attributes; all other attributes default to zero."""
 _OF_THE_POSE = frozenset({"springref"})
-"""Attributes that stay with a joint: they are of where it stands, not of what it is."""
+"""Attributes that stay with a joint since they depend on its pose."""
 _NONE, _FIXED, _AFFINE = 0.0, 0.0, 1.0
-"""MuJoCo's enumerations of what a position servo is: no dynamics, a fixed gain, an affine bias."""
+"""MuJoCo's enumeration values of a position servo: no dynamics, fixed gain, affine bias."""
 
 
 def default_class(
     applied: Applied, joint: int, actuator: int | None, name: str, notes: Sequence[str] = ()
 ) -> str:
-    """The class as an element ``<default class="NAME">``, with a comment for each cause.
+    """Render a default class as ``<default class="NAME">``, with a comment for each cause.
 
     Args:
-        applied: the model with causes in it.
-        joint: number of the joint in it.
-        actuator: number of its actuator; None without one.
-        name: of the class.
+        applied: model with the causes applied.
+        joint: number of the joint in the model.
+        actuator: number of the actuator of the joint; None if there is none.
+        name: name of the class.
         notes: further comments.
     """
     lines = [f'<default class="{name}">', *(f"  {_comment(note)}" for note in notes)]
@@ -49,7 +49,7 @@ def default_class(
 
 
 def _stated(element: Element, values: Mapping[str, Values]) -> tuple[str, dict[str, str]]:
-    """The tag of an element in a class, and what it states."""
+    """Return the tag of an element in a default class, and its attributes as text."""
     own = {
         name: value
         for name, value in values.items()
@@ -74,7 +74,7 @@ def _is_usual(name: str, values: Values) -> bool:
 
 
 def _is_servo(values: Mapping[str, Values]) -> bool:
-    """Whether it is what ``position`` stands for."""
+    """Return whether actuator attributes are those of MJCF's ``position`` shortcut."""
     kinds = values["dyntype"][0], values["gaintype"][0], values["biastype"][0]
     offset, stiffness = values["biasprm"][:2]
     return kinds == (_NONE, _FIXED, _AFFINE) and offset == 0 and stiffness == -values["gainprm"][0]
@@ -83,18 +83,18 @@ def _is_servo(values: Mapping[str, Values]) -> bool:
 def using(
     robot: Robot, applied: Applied, joint: int, actuator: int | None, name: str, text: str
 ) -> str:
-    """The robot's file, with all causes, in which a joint and its actuator are of the class.
+    """Render the model file with all causes, where a joint and its actuator use the class.
 
     Args:
-        robot: what was read.
-        applied: its model with causes in it.
-        joint: number of the joint in it.
-        actuator: of its actuator.
-        name: of the class.
-        text: the class, of `default_class`.
+        robot: robot as read from its model file.
+        applied: model with the causes applied.
+        joint: number of the joint in the model.
+        actuator: number of the actuator of the joint; None if there is none.
+        name: name of the class.
+        text: the class, from `default_class`.
 
     Raises:
-        UnfitError: it would not be the model that was meant; says in what.
+        UnfitError: the rendered file differs from the modified model; states the field.
     """
     document = Document(applied.text.encode(), robot.path)
     tags = document.numbered(applied.model)
@@ -121,6 +121,6 @@ def using(
 
 
 def _comment(text: str) -> str:
-    # Two hyphens end a comment too early.
+    # Two hyphens would end an XML comment early.
     safe = text.replace("--", "- -")
     return f"<!-- {safe} -->"

@@ -1,5 +1,6 @@
-"""An MJCF as its author wrote it, with what it includes: the elements that a compiled model
-numbers, and where they stand in which file.
+"""An MJCF source document with its included files.
+
+It relates the elements of the source text to their numbers in the compiled model.
 """
 
 from __future__ import annotations
@@ -12,23 +13,23 @@ from sims.robot.markup import Markup, Tag, UnfitError
 from sims.robot.stated import Element
 
 _TWICE = ("replicate", "attach", "composite", "flexcomp", "model")
-"""Elements that stand for several, or for those of another file."""
+"""Elements that generate several elements, or refer to those of another file."""
 
 FILES = ("mesh", "texture", "hfield", "skin")
-"""Elements that name a file."""
+"""Elements that refer to a file."""
 
 _DIRECTORIES = ("assetdir", "meshdir", "texturedir")
 
 
 class Document:
-    """An MJCF with all its files.
+    """An MJCF with all its included files.
 
     Attributes:
-        main: the outer file.
-        root: its outermost element.
+        main: text of the outer file.
+        root: root element of the outer file.
 
     Raises:
-        UnfitError: a file is no XML, or is missing.
+        UnfitError: a file is missing, or is not XML.
     """
 
     def __init__(self, text: bytes, path: Path) -> None:
@@ -52,7 +53,7 @@ class Document:
             self._include(inner.root)
 
     def children(self, tag: Tag) -> Iterator[Tag]:
-        """The elements in an element, those of included files among them."""
+        """Yield the children of an element, including those from included files."""
         for child in tag.children:
             if child in self._included:
                 yield from self.children(self._included[child].root)
@@ -60,23 +61,23 @@ class Document:
                 yield child
 
     def walk(self, tag: Tag | None = None) -> Iterator[Tag]:
-        """All elements below one."""
+        """Yield all descendants of an element; of the root if None."""
         for child in self.children(tag or self.root):
             yield child
             yield from self.walk(child)
 
     def under(self, *names: str) -> list[Tag]:
-        """All elements to which these names lead from the root."""
+        """Return all elements at a path of names from the root."""
         found = [self.root]
         for name in names:
             found = [child for tag in found for child in self.children(tag) if child.name == name]
         return found
 
     def numbered(self, model: Any) -> dict[Element, Tag]:
-        """The elements by their numbers in the compiled model.
+        """Map element numbers of the compiled model to the elements of the text.
 
         Raises:
-            UnfitError: they are not those of the file.
+            UnfitError: the compiled model has other elements than the text.
         """
         for tag in self.walk():
             if tag.name in _TWICE:
@@ -93,7 +94,7 @@ class Document:
         return found
 
     def _body(self, tag: Tag, bodies: list[Tag], joints: list[Tag]) -> None:
-        """Bodies depth first, and the joints of each before those of its children."""
+        """Collect bodies depth first, and the joints of each body before those of its children."""
         below: list[Tag] = []
         self._within(tag, below, joints)
         for body in below:
@@ -110,7 +111,14 @@ class Document:
                 self._within(child, bodies, joints)
 
     def rooted(self, folder: Path) -> bool:
-        """Let files be found from wherever the text is; whether it names any."""
+        """Make asset folders absolute, so that the text can be loaded from anywhere.
+
+        Args:
+            folder: folder of the model file.
+
+        Returns:
+            Whether the text refers to any asset files.
+        """
         named = any(
             tag.name in FILES and any(key.startswith("file") for key in tag.attributes)
             for tag in self.walk()
@@ -128,7 +136,7 @@ class Document:
             }
         both = stated.get("assetdir", "")
         found = {key: str(folder / stated.get(key, both)) for key in ("meshdir", "texturedir")}
-        # What the last one says holds.
+        # The last compiler element takes precedence.
         if compilers:
             compilers[-1].new |= found
         else:
@@ -136,7 +144,7 @@ class Document:
             self.root.within.append(([], f"<compiler {said}/>"))
 
     def written(self) -> str:
-        """The text with all changes; a file that changes stands in the place of its include."""
+        """Return the text with all changes; changed files replace their include elements."""
         self._settle(self.root)
         return self.main.whole().decode()
 
@@ -155,7 +163,7 @@ class Document:
 
 
 def _compare(found: dict[Element, Tag], model: Any, counts: tuple[int, int, int]) -> None:
-    """Refuse elements that are not those of the compiled model."""
+    """Raise an error if elements differ from those of the compiled model."""
     wanted = (model.nbody, model.njnt, len(model.actuator_ctrlnum))
     if counts != wanted:
         raise UnfitError("the compiled model has other elements")

@@ -1,4 +1,4 @@
-"""What a sensor of the drives' forces shows, where MuJoCo does not know it."""
+"""Readings of drive-force sensors, with corrections that MuJoCo's own sensors do not contain."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from sims.system import Acting
 
 @dataclass(frozen=True)
 class Shown:
-    """Readings of what drives exert, of the lanes of a bench.
+    """Drive-force readings of the batch elements of one MuJoCo batch.
 
     Attributes:
-        robot: whose.
-        system: of it.
-        bench: the lanes.
-        given: what they were given.
-        step: seconds.
+        robot: robot that is simulated.
+        system: system of the robot.
+        bench: MuJoCo batch.
+        given: inputs of the batch elements.
+        step: step length in seconds.
     """
 
     robot: Robot
@@ -39,8 +39,9 @@ class Shown:
     step: float
 
     def as_given(self, readings: Array) -> None:
-        """Let what actuators exert (n, S, k) be that of the command when each step begins, in place
-        of its mean over the step.
+        """Shift readings (n, S, k) from the mean command of a step to its initial command.
+
+        The readings are changed in place.
         """
         given, bench = self.given, self.bench
         n = len(readings)
@@ -60,8 +61,16 @@ class Shown:
                 readings[:, :, bench.drives[first.name]] += arms[:, None] * (column - before)
 
     def as_exerted(self, readings: Array, x: Array, v: Array, acting: Acting) -> None:
-        """Let it have what effects in the drives add, a dead zone of a servo or a supply that sags,
-        which act as forces from outside; at positions and velocities (n, S + 1, D).
+        """Add the forces of effects in the drives, such as a dead zone or a voltage drop.
+
+        The simulation applies these effects as external forces, so MuJoCo's sensors do not contain
+        them.
+
+        Args:
+            readings: (n, S, k) sensor readings; changed in place.
+            x: (n, S + 1, D) positions.
+            v: (n, S + 1, D) velocities.
+            acting: active effects with their coefficients.
         """
         lanes = np.flatnonzero(lanes_with(acting, len(x), is_in_drive))
         if not lanes.size:
@@ -71,12 +80,12 @@ class Shown:
         shown = readings[lanes][:, :, columns]
 
         def flat(values: Array) -> Array:
-            """All instants of these lanes below each other."""
+            """Stack all sample times of the selected batch elements into one axis."""
             return values[lanes, :steps].reshape(lanes.size * steps, -1)
 
         inputs = {name: flat(u) for name, u in given.felt.items()}
         for one in self.robot.actuators:
-            # What is behind a filter does not change within a step.
+            # The output of an activation filter does not change within a step.
             if not self._is_filtered(one):
                 inputs[f"u.{one.name}"] = flat(given.instant[:, :, one.control])
         t = np.tile(self.step * np.arange(float(steps)), lanes.size)[:, None]
@@ -93,7 +102,7 @@ class Shown:
         readings[lanes[:, None, None], np.arange(steps)[:, None], columns] = shown
 
     def _by_control(self, actuator: Actuator) -> Array:
-        """(LANES,) what one unit of an actuator's control exerts on its joint at once."""
+        """Return the immediate joint force per unit of an actuator's control, (LANES,)."""
         gear = float(self.robot.compiled.actuator_gear[actuator.id, 0])
         gain: Array = self.bench.fields["actuator_gainprm"][:, actuator.id, 0]
         direct = actuator.kind in ("motor", "position", "velocity")
@@ -101,11 +110,11 @@ class Shown:
         return gear * gain if direct else np.zeros_like(gain)
 
     def _is_filtered(self, actuator: Actuator) -> bool:
-        """Whether a filter stands before it, so that a control has no effect at once."""
+        """Return whether a filter precedes the actuator, so that controls act with a delay."""
         return any(one.actuator == actuator for one in activation_filters(self.robot))
 
     def _limits(self, actuator: Actuator) -> tuple[float, float]:
-        """Of what it exerts on its joint, as far as the file states them."""
+        """Return lower and upper limit of an actuator's joint force; infinite if unspecified."""
         gear = abs(float(self.robot.compiled.actuator_gear[actuator.id, 0]))
         low, high = actuator.force or (-np.inf, np.inf)
         assert actuator.joint is not None

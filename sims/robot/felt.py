@@ -1,4 +1,4 @@
-"""What a robot feels of its commands, step by step."""
+"""Inputs of a robot as applied to the plant over each simulation step."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from sims.robot.midway import Mask, Places
 from sims.system import Acting, Input
 
 INSTANT = 1e-6
-"""Share of a step that is as good as its beginning."""
+"""Share of a step, from its beginning, over which the input counts as its initial value."""
 SHARE = 1e-6
-"""Of a step by which a run may exceed a whole number of them."""
+"""Tolerance, as a share of a step, within which a time counts as the end of a step."""
 PARTS: Array = np.array([0.25, 0.5, 0.75, 1.0])
-"""Shares of a step at which it is divided, to see where in it a command changes."""
+"""Fractions of a step at which it is subdivided, to resolve changes of a command within it."""
 KEPT = 64 * 2**20
-"""Bytes of answers that are kept."""
+"""Maximum size of cached applied inputs, in bytes."""
 PLAIN: Array = np.array([1.0])
-"""The same of a step that is not divided."""
+"""Fractions of a step that is not subdivided."""
 OWN = "u"
-"""What an input is called that is looked at for itself."""
+"""Name given to an input that is evaluated separately."""
 TOGETHER = 128
-"""Lanes of inputs that are looked at together, at most."""
+"""Maximum number of batch elements whose inputs are evaluated together."""
 
 
 class _Known:
-    """Answers by what was asked, the last ones."""
+    """Cache of arrays that is emptied when it exceeds `KEPT` bytes."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[object, ...], Array] = {}
         self._bytes = 0
 
     def get(self, key: tuple[object, ...], make: Callable[[], Array]) -> Array:
-        """The answer, made if it is not known."""
+        """Return the cached array, or make and cache it."""
         if key not in self._kept:
             made = make()
             self._bytes += made.nbytes
@@ -52,11 +52,14 @@ class _Known:
 
 
 _known = _Known()
-"""What is felt where nothing acts: thousands of simulations are given the same commands."""
+"""Cache of applied inputs without input effects.
+
+Thousands of simulations share the same commands.
+"""
 
 
 def _digest(times: Array, signal: Array) -> bytes:
-    """Of a signal and its instants."""
+    """Compute the digest of a signal and its sample times."""
     digest = hashlib.blake2b(times.tobytes(), digest_size=16)
     digest.update(signal.tobytes())
     return digest.digest()
@@ -71,11 +74,23 @@ def felt(
     steps: int,
     share: float = 1.0,
 ) -> dict[str, Array]:
-    """What n lanes feel of each input over the steps, (n, S) by name: as a step has to be given
-    it, or as it is in the first share of each.
+    """Compute the applied inputs of n batch elements over S steps.
+
+    Args:
+        step: step length in seconds.
+        scenario: scenario of the run.
+        commands: commanded inputs (T,) by name.
+        acting: active effects with their coefficients (K, n, 1).
+        n: number of batch elements.
+        steps: number S of steps.
+        share: share of each step, from its beginning, over which the input is averaged. The default
+            1.0 gives the value to apply over the whole step.
+
+    Returns:
+        Applied inputs (n, S) by name.
     """
     times = scenario.times - scenario.times[0] + scenario.offset
-    # Where commands change with the steps a mean says all of them.
+    # If commands change only at step ends, the mean describes each step completely.
     places = times / step
     aligned = bool((np.abs(places - np.rint(places)) < SHARE).all())
     seen = np.zeros(steps + 1, dtype=bool)
@@ -93,7 +108,8 @@ def felt(
         plain = _known.get(key, partial(_given, step, scenario, [bare], steps, seen, usual))
         felt[name] = np.repeat(plain, n, axis=0)
         passed = tuple((e, c) for e, c in acting if isinstance(e, Input) and e.signal == name)
-        # What is given to a lane must not hang on the company that it is in.
+        # Inputs are grouped by effects, so that the value of a batch element does not depend on
+        # others.
         asked += [_Asked(name, signal, *part) for part in _by_kinds(passed, n)]
     cuts = PARTS if usual is PLAIN else usual
     for group in _groups(asked):
@@ -105,7 +121,14 @@ def felt(
 
 
 class _Asked(NamedTuple):
-    """One input, what it is told, and the lanes in which effects act on it."""
+    """Request for one applied input.
+
+    Attributes:
+        name: name of the input.
+        signal: (T,) commanded values.
+        lanes: batch elements in which input effects are active.
+        acting: these effects, with coefficients for the batch elements.
+    """
 
     name: str
     signal: Array
@@ -114,7 +137,7 @@ class _Asked(NamedTuple):
 
 
 def _alone(scenario: Scenario, name: str) -> Scenario:
-    """What is known of one input, under the name `OWN`."""
+    """Restrict a scenario to one input, under the name `OWN`."""
     return replace(
         scenario,
         inputs={},
@@ -124,7 +147,7 @@ def _alone(scenario: Scenario, name: str) -> Scenario:
 
 
 def _by_kinds(passed: Acting, n: int) -> Iterator[tuple[Places, Acting]]:
-    """Lanes in which the same effects act, and what acts there."""
+    """Group batch elements by their active effects."""
     there = np.array([(c != 0).any(axis=(0, 2)) for _, c in passed], dtype=bool).reshape(-1, n)
     kinds, of = np.unique(there, axis=1, return_inverse=True)
     for number, kind in enumerate(kinds.T):
@@ -134,8 +157,10 @@ def _by_kinds(passed: Acting, n: int) -> Iterator[tuple[Places, Acting]]:
 
 
 def _groups(asked: Sequence[_Asked]) -> Iterator[list[_Asked]]:
-    """Those on whose ways the same kinds of effects lie, in the same order: what remembers is
-    stepped, and a step costs alike for few lanes and for many.
+    """Group requests with equal sequences of effect types, of at most `TOGETHER` batch elements.
+
+    Effects with a state are integrated step by step, and a step costs about the same for few and
+    for many batch elements.
     """
     alike: dict[tuple[str, ...], list[_Asked]] = {}
     for one in asked:
@@ -148,7 +173,7 @@ def _groups(asked: Sequence[_Asked]) -> Iterator[list[_Asked]]:
 
 
 def _together(asked: Sequence[_Asked]) -> Acting:
-    """What lies on the ways of a group, for its lanes one after the other."""
+    """Concatenate the effects of a group of requests along the batch elements."""
     first = [effect for effect, _ in asked[0].acting]
     rows = zip(*([c for _, c in one.acting] for one in asked), strict=True)
     return tuple((effect, np.concatenate(c, axis=1)) for effect, c in zip(first, rows, strict=True))
@@ -162,7 +187,7 @@ def _given(
     seen: Mask,
     cuts: Array,
 ) -> Array:
-    """(N, S) what the lanes that are asked for are given in steps that are divided at `cuts`."""
+    """Compute the applied inputs (N, S) of requests, with steps subdivided at `cuts`."""
     acting = _together(asked)
     of = np.repeat(np.arange(len(asked)), [one.lanes.size for one in asked])
     runs = Runs(tuple(_alone(scenario, one.name) for one in asked), of)
@@ -174,7 +199,7 @@ def _given(
 
 
 def _parts_of_steps(step: float, steps: int, n: int, cuts: Array, alike: bool) -> Plan:
-    """Steps divided at these shares of them."""
+    """Make the plan of steps that are subdivided at the given fractions."""
     begins: Array = step * np.arange(float(steps))
     ends = (begins[:, None] + step * cuts).ravel()
     lengths = np.diff(ends, prepend=0.0)
@@ -185,19 +210,21 @@ def _parts_of_steps(step: float, steps: int, n: int, cuts: Array, alike: bool) -
 
 
 def moments_kept(parts: Array, seen: Mask) -> Array:
-    """(n, S) what to give over each step, of means (n, S, 4) over its quarters.
+    """Compute the inputs of steps (n, S) from their means (n, S, 4) over the quarters of each step.
 
-    A step of length h takes one control. With m its mean and D its first moment about the middle,
+    A step of length h has one constant control. Its mean is that of the command. The first moment
+    of the command about the middle of the step,
 
         D = 1 / h^2 times the integral of (s - h / 2) u(s)                                 (1)
 
-    the pair that a command asks for is given by -D in the step and +D in the next one (or in the
-    step before and in this one, where a sample lies between: between samples nobody looks). A
-    command that changes within a step is then neither early nor late by a share of it.
+    is reproduced by adding -D to the step and +D to the next one. If a sample is at the end of the
+    step and none at its beginning, -D is added to the previous step and +D to this one, since only
+    the states at samples are observed. So a command that changes within a step is applied neither
+    early nor late by a fraction of the step.
 
     Args:
-        parts: (n, S, 4).
-        seen: (S + 1,) at which ends of steps a sample lies.
+        parts: (n, S, 4) means over the quarters.
+        seen: (S + 1,) whether a sample is at the beginning of the first step and at each step end.
     """
     weights = (np.arange(4.0) + 0.5) / 4.0 - 0.5
     moments = (parts * weights).mean(axis=2)  # (1)

@@ -1,14 +1,15 @@
-"""Bodies that float (free joints) or turn on balls (ball joints): where a run begins with them, and
-small moves of them.
+"""Free and ball joints: their initial states and small displacements.
 
-No channel is one of their coordinates, so none of them is estimated: each run begins with what the
-recording states of it, else with what the file has. A pose is a position, of a free joint alone,
-and a unit quaternion (w, x, y, z); a small move d of it has three numbers for each,
+No channel observes one of their coordinates, so none of them is estimated. Each run begins with the
+values that the recording specifies, else with those of the model file. A pose is a position (free
+joints only) and a unit quaternion (w, x, y, z). A small displacement d of it has three numbers for
+each,
 
     position + d_p,   q exp(d_r / 2),                                                          (1)
 
-the world's axes for the first, the body's for the second, as MuJoCo has velocities (MuJoCo,
-*Computation*, "Floating objects"; J. Solà, arXiv:1711.02508, eqs. (101) and (190)).
+along the world's axes for the position, and along the body's axes for the rotation. This is
+MuJoCo's convention for velocities (MuJoCo, *Computation*, "Floating objects"; J. Solà,
+arXiv:1711.02508, eqs. (101) and (190)).
 """
 
 from __future__ import annotations
@@ -27,12 +28,16 @@ from sims.robot.model import Joint, Robot
 Places = NDArray[np.intp]
 AXES, TURN, SPIN = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("wx", "wy", "wz")
 LEAST = 1e-6
-"""Length of a quaternion that is none."""
+"""Minimum length of a valid quaternion, and of a rotation vector that is not treated as zero."""
 
 
 class Own(NamedTuple):
-    """Of a joint: its axes of translation, of which a ball has none; where its quaternion stands in
-    a pose; and the number of the first of its moves.
+    """Layout of the numbers of one floating joint.
+
+    Attributes:
+        axes: axes of translation; empty for a ball joint.
+        turn: slice of the quaternion within a pose.
+        first: index of the first number of its displacement.
     """
 
     axes: tuple[str, ...]
@@ -53,8 +58,8 @@ class Floating:
 
     Attributes:
         joints: free and ball joints.
-        positions: (P,) in qpos.
-        velocities: (F,) in qvel.
+        positions: (P,) addresses in qpos.
+        velocities: (F,) addresses in qvel.
     """
 
     joints: tuple[Joint, ...]
@@ -63,7 +68,7 @@ class Floating:
 
     @classmethod
     def of(cls, robot: Robot) -> Floating:
-        """Those of a robot."""
+        """Return the floating joints of a robot."""
         joints = tuple(joint for joint in robot.joints if not joint.single)
         positions = [j.position + k for j in joints for k in range(len(_axes(j) + TURN))]
         velocities = [j.velocity + k for j in joints for k in range(len(_axes(j) + SPIN))]
@@ -73,14 +78,18 @@ class Floating:
         return bool(self.joints)
 
     def names(self) -> tuple[list[str], list[str]]:
-        """Of positions and velocities, as recordings state them: ``q.base.qw``, ``qd.base.wx``."""
+        """Return the names of positions and velocities, such as ``q.base.qw``, ``qd.base.wx``."""
         axes = [(joint.name, _axes(joint)) for joint in self.joints]
         positions = [f"q.{name}.{axis}" for name, own in axes for axis in own + TURN]
         velocities = [f"qd.{name}.{axis}" for name, own in axes for axis in own + SPIN]
         return positions, velocities
 
     def units(self) -> dict[str, str]:
-        """Of both, by name: m and m/s by the world's axes, 1 of a quaternion, rad/s."""
+        """Return the units of positions and velocities by name.
+
+        Positions are in m and velocities in m/s along the world's axes; quaternions have the unit
+        1, and angular velocities rad/s.
+        """
         units: dict[str, str] = {}
         for joint in self.joints:
             units |= {f"q.{joint.name}.{axis}": "m" for axis in _axes(joint)}
@@ -90,13 +99,13 @@ class Floating:
         return units
 
     def states(self, model: Any) -> dict[str, float]:
-        """What the file has, by name."""
+        """Return the default states of the model file, by name."""
         positions, velocities = self.names()
         poses = model.qpos0[self.positions].tolist()
         return dict(zip(positions, poses, strict=True)) | dict.fromkeys(velocities, 0.0)
 
     def begun(self, states: Mapping[str, float]) -> Afloat:
-        """Where a run begins, (P,) and (F,), by what is known of it.
+        """Return the initial state of a run, (P,) and (F,), from known states by name.
 
         Raises:
             InputError: a quaternion is zero.
@@ -113,10 +122,19 @@ class Floating:
         return Afloat(pose, rate)
 
     def moved(self, pose: Array, number: int, by: float) -> Array:
-        """Poses (n, P) with one of the F numbers of a small move made, as (1) has it."""
+        """Displace poses along one degree of freedom, by (1).
+
+        Args:
+            pose: (n, P) poses.
+            number: index of the degree of freedom, below F.
+            by: displacement in m or rad.
+
+        Returns:
+            The displaced poses (n, P).
+        """
         result = pose.copy()
         for axes, turn, first in self._own:
-            # of a free joint the place comes first
+            # A free joint has its position before its quaternion.
             own = number - first - len(axes)
             if -len(axes) <= own < 0:
                 result[:, turn.start + own] += by
@@ -127,21 +145,21 @@ class Floating:
         return result
 
     def displaced(self, pose: Array, moves: Array) -> Array:
-        """Return poses (n, P) after small moves (n, F), by (1)."""
+        """Return poses (n, P) after small displacements (n, F), by (1)."""
         result = pose.copy()
         for axes, turn, first in self._own:
             place = slice(turn.start - len(axes), turn.start)
             result[:, place] += moves[:, first : first + len(axes)]
             rotation = moves[:, first + len(axes) : first + len(axes) + len(SPIN)]
             angle = np.linalg.norm(rotation, axis=1, keepdims=True)
-            # sin(a / 2) / a, which is 1 / 2 at zero.
+            # sin(a / 2) / a, whose limit is 1 / 2 at a = 0.
             half = 0.5 * np.sinc(angle / (2.0 * np.pi))
             small = np.concatenate([np.cos(0.5 * angle), half * rotation], axis=1)
             result[:, turn] = _product(pose[:, turn], small)
         return result
 
     def apart(self, pose: Array, reference: Array) -> Array:
-        """(n, F) the moves that lead from reference poses (n, P) to poses."""
+        """Compute the displacements (n, F) from reference poses (n, P) to poses (n, P)."""
         parts = []
         for axes, turn, _ in self._own:
             place = slice(turn.start - len(axes), turn.start)
@@ -152,7 +170,7 @@ class Floating:
 
     @cached_property
     def _own(self) -> tuple[Own, ...]:
-        """Where each joint's numbers stand."""
+        """Layout of each joint's numbers."""
         own, end, first = [], 0, 0
         for axes in map(_axes, self.joints):
             end += len(axes + TURN)
@@ -162,12 +180,12 @@ class Floating:
 
 
 def _axes(joint: Joint) -> tuple[str, ...]:
-    """Along which it moves from its place."""
+    """Return the axes of translation of a floating joint."""
     return AXES if joint.kind == "free" else ()
 
 
 def _product(one: Array, other: Array) -> Array:
-    """(n, 4) Hamilton products."""
+    """Compute Hamilton products (n, 4) of quaternions."""
     a, u = one[:, :1], one[:, 1:]
     b, v = other[:, :1], other[:, 1:]
     real = a * b - np.sum(u * v, axis=1, keepdims=True)
@@ -175,7 +193,7 @@ def _product(one: Array, other: Array) -> Array:
 
 
 def _logarithm(turn: Array) -> Array:
-    """(n, 3) rotation vectors of unit quaternions, the shorter way round."""
+    """Compute rotation vectors (n, 3) of unit quaternions, with angles of at most pi."""
     sign = np.where(turn[:, :1] < 0, -1.0, 1.0)
     real, vector = sign * turn[:, :1], sign * turn[:, 1:]
     length = np.linalg.norm(vector, axis=1, keepdims=True)

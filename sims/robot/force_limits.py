@@ -1,14 +1,14 @@
-"""Joints at which a servo that reaches its force limit makes a motion jump.
+"""Joints at which a stiff servo makes the motion jump when it reaches its force limit.
 
 MuJoCo's implicit integrators treat the velocity gain kv of a servo implicitly, except in a step in
 which its force F is at a limit (`mjd_smooth_vel`: a clamped force does not depend on the velocity).
-With h the step, M the inertia at the joint, and r = h kv / M, the velocity then changes by h F / M
-in place of h F / (M + h kv), and back in the next step: the position jumps by about
+With the step h, the inertia M at the joint, and r = h kv / M, the velocity then changes by h F / M
+instead of h F / (M + h kv), and changes back in the next step. The position jumps by about
 
     (h² F / M) r / (1 + r)                                                                      (1)
 
-whenever the force that is commanded crosses the limit, and the other joints by the reaction. A
-linear model tells nothing of such steps.
+whenever the commanded force crosses the limit. The other joints jump by the reaction. A linearised
+model does not contain such jumps.
 """
 
 from __future__ import annotations
@@ -21,18 +21,21 @@ from sims.base import Array
 from sims.robot.inertia_matrix import inertia_matrix
 
 STIFF = 0.1
-"""The r from which a servo is stiff."""
+"""Minimum r (see the module) of a stiff servo."""
 NEAR = 0.9
-"""Share of a limit from which a force may have been at it: its state is not known exactly."""
+"""Share of a force limit from which the limit counts as possibly reached.
+
+It is below 1 since the state is not known exactly.
+"""
 
 
 class ForceLimits(NamedTuple):
-    """K force limits of stiff servos.
+    """Force limits of K stiff servos.
 
     Attributes:
-        outputs: of each, the force that it limits: a field of MuJoCo's data and its column.
-        sizes: (K,) forces from which they may be reached, in units of the field.
-        jumps: (K, nv) changes of all positions, at the joint by (1).
+        outputs: limited force of each servo: a field of MuJoCo's data and the column.
+        sizes: (K,) forces from which the limits may be reached, in units of the field.
+        jumps: (K, nv) jumps of all positions; at the servo's own joint by (1).
     """
 
     outputs: tuple[tuple[str, int], ...]
@@ -73,8 +76,15 @@ def stiff_force_limits(model: Any) -> ForceLimits:
 
 
 def _jump(model: Any, dof: int, force: float, gains: Array) -> Array:
-    """What a step with the force of a servo at its limit adds to all positions (nv,); the servos of
-    other joints are not at theirs.
+    """Compute the jump of all positions (nv,) in a step in which one servo is at its force limit.
+
+    The servos of the other joints are taken as not limited.
+
+    Args:
+        model: the mujoco.MjModel.
+        dof: degree of freedom of the servo's joint.
+        force: force limit at the joint, in N or N m.
+        gains: (nv,) velocity gains of the servos at the joints.
     """
     inertia, step, others = inertia_matrix(model), model.opt.timestep, gains.copy()
     others[dof] = 0.0
@@ -87,7 +97,7 @@ def _jump(model: Any, dof: int, force: float, gains: Array) -> Array:
 
 
 def _dof(model: Any, actuator: int) -> int | None:
-    """The degree of freedom on which an actuator acts; None where that is no single joint."""
+    """Return the degree of freedom of an actuator's joint; None if it drives no hinge or slide."""
     import mujoco
 
     joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))

@@ -1,6 +1,4 @@
-"""Forces of effects on a robot: those that are known beforehand, and those that are asked for in
-every step, of all lanes at once.
-"""
+"""Effect forces on batches of a robot, precomputed or evaluated in every step."""
 
 from __future__ import annotations
 
@@ -20,7 +18,7 @@ from sims.robot.system import RobotSystem
 from sims.system import Acting, Effect, Force, Friction, Hidden, State
 
 OVER_TIME = frozenset({"force.bias", "force.periodic"})
-"""Effects whose force hangs on nothing but time."""
+"""Effects whose force depends on time alone."""
 
 LOADED = frozenset(
     {
@@ -31,7 +29,7 @@ LOADED = frozenset(
         "supply.sag",
     }
 )
-"""Effects that look at what transmissions carry."""
+"""Effects that depend on the loads of transmissions."""
 
 
 def moment_of(
@@ -43,8 +41,16 @@ def moment_of(
     carried: Array,
     stiffness: Array | None = None,
 ) -> RobotMoment:
-    """The instant of lanes; t (L, 1), `carried` (2, L, D), all others (L, D); without `stiffness`
-    no servo is at work.
+    """Make a snapshot of batch elements.
+
+    Args:
+        system: system of the robot.
+        t: (L, 1) time since the start in seconds.
+        x: (L, D) positions.
+        v: (L, D) velocities.
+        inputs: applied inputs (L, 1) by name.
+        carried: (2, L, D) forces on both sides of the transmissions.
+        stiffness: (L, D) stiffness of position servos; no servo is active if None.
     """
     theta = np.zeros((len(x), 0))
     stiff = np.zeros((0, 0)) if stiffness is None else stiffness
@@ -54,13 +60,20 @@ def moment_of(
 
 
 def over_time(system: RobotSystem, acting: Acting, t: Array, size: int, lanes: int) -> Array:
-    """(L, S, D) forces that hang on time alone, at the beginnings t (S,) of steps and half a step
-    later.
+    """Compute the forces (L, S, D) of effects that depend on time alone.
+
+    Args:
+        system: system of the robot.
+        acting: active effects with their coefficients (K, L, 1).
+        t: (S,) beginnings of the steps in seconds; forces are evaluated half a step later.
+        size: number D of coordinates.
+        lanes: number L of batch elements.
     """
     result = np.zeros((lanes, t.size, size))
     half = 0.5 * (t[1] - t[0]) if t.size > 1 else 0.0
     nothing = np.zeros((t.size, size))
-    # The force in the middle of a step gives the momentum that the force over it does.
+    # The force at the middle of a step gives the momentum of the force over the step, to second
+    # order.
     moment = moment_of(system, (t + half)[:, None], nothing, nothing, {}, np.stack([nothing] * 2))
     for effect, c in acting:
         if effect.of not in OVER_TIME or not isinstance(effect, Force):
@@ -72,29 +85,29 @@ def over_time(system: RobotSystem, acting: Acting, t: Array, size: int, lanes: i
 
 
 class Forces:
-    """Forces of effects that hang on where the robot is.
+    """State-dependent effect forces on a batch.
 
     Attributes:
-        rubs: (L, D) where dry friction is among them.
-        loaded: (L,) where one looks at what transmissions carry.
-        system: the robot's.
-        felt: inputs as they are felt, (L, S) by name.
-        addresses: of the joints.
-        stiffness: (L, D) of their position servos.
-        step: seconds.
-        forces: the effects that push, with their coefficients (K, L, 1).
-        frictions: those that rub.
-        hidden: those with states.
-        working: (L, S, D) 0 where a position servo is switched off and 1 elsewhere; None where all
-            are on.
+        rubs: (L, D) whether an effect adds dry friction.
+        loaded: (L,) whether an effect depends on the loads of transmissions.
+        system: system of the robot.
+        felt: applied inputs (L, S) by name.
+        addresses: addresses of the joints.
+        stiffness: (L, D) stiffness of the position servos.
+        step: step length in seconds.
+        forces: effects with a force, with their coefficients (K, L, 1).
+        frictions: effects with dry friction, with their coefficients.
+        hidden: effects with hidden states, with their coefficients.
+        working: (L, S, D) 0 where a position servo is switched off and 1 elsewhere; None if all are
+            on.
 
     Args:
-        system: see above.
+        system: see the attributes.
         acting: effects at one place each.
-        felt: see above.
-        addresses: see above.
-        stiffness: see above.
-        step: see above.
+        felt: see the attributes.
+        addresses: see the attributes.
+        stiffness: see the attributes.
+        step: see the attributes.
     """
 
     def __init__(
@@ -128,11 +141,11 @@ class Forces:
         self._states: list[State] = []
 
     def at(self, k: int, look: Look) -> tuple[Array, Array]:
-        """Forces and limits of dry friction (L, D) each, over step k: those of its middle.
+        """Compute forces and dry friction limits (L, D) at the middle of step k.
 
         Args:
-            k: every step in turn.
-            look: the lanes at its beginning.
+            k: number of the step; must increase by one from call to call.
+            look: joint states at the beginning of the step.
         """
         x, v = middle(look.x, look.v, look.a, self.step)
         moment = self._moment(k + 0.5, k, (x, v, *look.later))
@@ -140,18 +153,18 @@ class Forces:
         if self.hidden:
             begun = self.begun(k, look)
             self._states = self._states or [e.begin(c, begun) for e, c in self.hidden]
-            # From the middle of the last step to that of this one.
+            # Hidden states advance from the middle of the previous step to the middle of this one.
             step = self.step if k else 0.5 * self.step
             more, self._states = remembered(self.hidden, (begun, moment), self._states, step)
             force += more
         return force, rubbed(self.frictions, moment)
 
     def begun(self, k: int, look: Look) -> RobotMoment:
-        """The instant at which step k begins."""
+        """Return the snapshot at the beginning of step k."""
         return self._moment(k, k, (look.x, look.v, *look.carried))
 
     def _moment(self, steps: float, k: int, motion: Sequence[Array]) -> RobotMoment:
-        """The instant after so many steps, with what is felt in step k."""
+        """Return the snapshot after a number of steps, with the inputs of step k."""
         x, v, *sides = motion
         now = np.full((len(x), 1), steps * self.step)
         inputs = {name: u[:, k, None] for name, u in self.felt.items()}
@@ -162,17 +175,17 @@ class Forces:
 
 
 def is_in_drive(effect: Effect) -> bool:
-    """Whether its force is the drive's own, and a sensor of what drives exert shows it."""
+    """Return whether the force of an effect is part of the drive force that a sensor reads."""
     return isinstance(effect, Force) and (effect.at == "actuator" or effect.of in COMMON)
 
 
 def exerted(acting: Acting, moment: RobotMoment) -> Array:
-    """(L, D) what effects in drives add to what these exert."""
+    """Compute the forces (L, D) that effects in drives add to the drives."""
     return pushed([(e, c) for e, c in acting if isinstance(e, Force) and is_in_drive(e)], moment)
 
 
 def pushed(forces: Sequence[tuple[Force, Array]], moment: RobotMoment) -> Array:
-    """(L, D) what effects exert."""
+    """Compute the total force (L, D) of effects."""
     total = np.zeros_like(moment.x)
     for effect, c in forces:
         total = total + effect.force(c, moment)
@@ -180,7 +193,7 @@ def pushed(forces: Sequence[tuple[Force, Array]], moment: RobotMoment) -> Array:
 
 
 def rubbed(frictions: Sequence[tuple[Friction, Array]], moment: RobotMoment) -> Array:
-    """(L, D) limits of dry friction."""
+    """Compute the total limits (L, D) of dry friction."""
     limit = np.zeros_like(moment.x)
     for effect, c in frictions:
         joint = effect.coordinate
@@ -195,13 +208,16 @@ def remembered(
     states: Sequence[State],
     step: float,
 ) -> tuple[Array, list[State]]:
-    """(L, D) forces of effects with states, and these so many seconds later.
+    """Advance hidden states of effects, and compute their forces afterwards.
 
     Args:
-        hidden: the effects with their coefficients.
-        moments: the one in the middle of those seconds, and the one at their end.
-        states: as they begin.
-        step: the seconds.
+        hidden: effects with their coefficients.
+        moments: snapshots at the middle and at the end of the interval.
+        states: hidden states at the beginning.
+        step: length of the interval in seconds.
+
+    Returns:
+        Total force (L, D) and hidden states at the end of the interval.
     """
     between, end = moments
     total = np.zeros_like(end.x)

@@ -1,13 +1,15 @@
-"""The two forms of dry friction that effects add to a robot's joints."""
+"""Solver forms of the dry friction that effects add to the joints of a robot."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 FrictionForm = Literal["stiff", "soft"]
-"""How MuJoCo's solver holds the dry friction that effects add: ``stiff`` is Coulomb friction, as
-stiff as the integrator allows; ``soft`` leaves the solver parameters of the model file
-(`solreffriction`, `solimpfriction`, MuJoCo's defaults where the file states none).
+"""Form in which MuJoCo's solver applies the dry friction that effects add.
+
+``stiff`` is Coulomb friction that is as stiff as the integrator allows. ``soft`` keeps the solver
+parameters of the model file (`solreffriction`, `solimpfriction`), or MuJoCo's defaults if the file
+does not specify them.
 """
 FRICTION_FORMS: tuple[FrictionForm, ...] = ("stiff", "soft")
-"""Both forms."""
+"""All values of `FrictionForm`."""

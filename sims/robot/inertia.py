@@ -1,4 +1,4 @@
-"""Principal moments of inertia that a body can have."""
+"""Physically valid principal moments of inertia."""
 
 from __future__ import annotations
 
@@ -9,20 +9,27 @@ import numpy as np
 from sims.base import Array
 
 LEAST = 1e-9
-"""kg m^2: what is taken for moments that are not positive; those of a gram on a millimetre."""
+"""Moment of inertia, in kg m^2, that replaces moments that are not positive.
+
+It is the moment of 1 g at a distance of 1 mm.
+"""
 NONE = 1e-14
-"""kg m^2 that are as good as zero; MuJoCo's limit is 1e-15."""
+"""Largest moment of inertia, in kg m^2, that counts as zero; MuJoCo's own limit is 1e-15."""
 ROUNDING = 1e-9
-"""Part of a moment by which sums are kept on the right side."""
+"""Margin for rounding in the triangle inequality, as a share of the largest moment."""
 
 
 def lack(moments: Array) -> float:
-    """By how much the largest moment exceeds the sum of the two others, kg m^2."""
+    """Return by how much the moments violate the triangle inequality, in kg m^2.
+
+    The violation is the largest moment minus the sum of the two others; it is negative or zero for
+    a physically valid body.
+    """
     return float(2 * np.max(moments) - np.sum(moments))
 
 
 def nearest(moments: Array) -> Array:
-    """The moments nearest to these, in kg m^2, that a body can have: positive, and A + B >= C."""
+    """Return the nearest physically valid moments, in kg m^2: positive, with A + B >= C."""
     raised: Array = np.maximum(moments, np.where(moments < NONE, LEAST, 0.0))
     third = (lack(raised) + ROUNDING * np.max(raised)) / 3
     if third <= ROUNDING * np.max(raised) / 3:
@@ -31,19 +38,34 @@ def nearest(moments: Array) -> Array:
 
 
 def principal(full: Sequence[float]) -> tuple[Array, Array]:
-    """Moments (3) and axes (3, 3), as columns, of a tensor: xx, yy, zz, xy, xz, yz in kg m^2."""
+    """Compute the principal moments and axes of an inertia tensor.
+
+    Args:
+        full: entries xx, yy, zz, xy, xz, yz of the tensor, in kg m^2.
+
+    Returns:
+        Principal moments (3,) in kg m^2, and axes (3, 3) as columns.
+    """
     xx, yy, zz, xy, xz, yz = full
     moments, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     return moments, axes
 
 
 def tensor(moments: Array, axes: Array) -> list[float]:
-    """The tensor of these moments about these axes, in the order that `principal` takes."""
+    """Compose an inertia tensor from principal moments and axes.
+
+    Args:
+        moments: (3,) principal moments in kg m^2.
+        axes: (3, 3) principal axes as columns.
+
+    Returns:
+        Entries xx, yy, zz, xy, xz, yz of the tensor, in kg m^2.
+    """
     full = axes @ np.diag(moments) @ axes.T
     return [float(full[at]) for at in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
 
 
 def shown(before: Array, after: Array) -> str:
-    """Moments before and after, kg m^2, as a note shows them."""
+    """Format the moments before and after a repair, in kg m^2, as text of a note."""
     rows = (", ".join(f"{moment:.4g}" for moment in sorted(row)) for row in (before, after))
     return " -> ".join(rows)

@@ -1,4 +1,4 @@
-"""The inertia matrix of a robot in the pose of its model file."""
+"""The joint-space inertia matrix of a robot in the reference pose of its model file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sims.base import Array
 
 
 def inertia_matrix(model: Any) -> Array:
-    """Return the inertia matrix (nv, nv) of a MuJoCo model in the pose that its file states."""
+    """Return the inertia matrix (nv, nv) of a MuJoCo model in its reference pose `qpos0`."""
     import mujoco
 
     data, matrix = mujoco.MjData(model), np.zeros((model.nv, model.nv))

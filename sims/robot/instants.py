@@ -1,5 +1,7 @@
-"""A robot at many instants of one motion, each in another lane of a batch: where a step leads from
-there, how it accelerates, and what effects exert.
+"""Robot states along one motion, for finite-difference linearisation.
+
+Each state is placed in another element of a batch. Computed are the states after a step,
+accelerations, and effect forces.
 """
 
 from __future__ import annotations
@@ -26,26 +28,27 @@ from sims.robot.system import RobotSystem
 from sims.system import Acting, Effect, Force, Friction, Hidden, State
 
 HELD = 0.004
-"""Seconds over which what is found at an instant holds: a pose changes little within."""
+"""Interval of the linearisation in seconds; a pose changes little within it."""
 SIDES = ("qfrc_actuator", "qfrc_bias")
-"""What presses on a joint's transmission from either side, in MuJoCo's data."""
+"""Fields of MuJoCo's data with the forces on both sides of a joint's transmission."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """One motion of a robot, and all that it was made with.
+    """One motion of a robot, with all its inputs.
 
     Attributes:
-        x, v: (S + 1, D) positions and velocities at the beginnings of steps, and at the end.
-        act: (S, na) activations at the beginnings.
-        controls: (S, nu).
-        instant: (S, nu) the same when each step begins.
-        forces: (S, nv) generalised, known beforehand.
-        inputs: (S,) what is felt of each input, by name.
-        carried: (2, S, D) what transmissions carry, from either side.
-        afloat: (S + 1, P) poses and (S + 1, F) velocities of what floats.
-        step: seconds.
-        off: (S, K) which actuators are switched off.
+        x: (S + 1, D) positions at the beginnings of steps, and at the end.
+        v: (S + 1, D) velocities at the beginnings of steps, and at the end.
+        act: (S, na) activations at the beginnings of steps.
+        controls: (S, nu) mean controls over each step.
+        instant: (S, nu) controls at the beginning of each step.
+        forces: (S, nv) precomputed generalised forces.
+        inputs: (S,) applied inputs by name.
+        carried: (2, S, D) forces on both sides of the transmissions.
+        afloat: (S + 1, P) poses and (S + 1, F) velocities of floating bodies.
+        step: step length in seconds.
+        off: (S, K) whether each actuator is switched off.
     """
 
     x: Array
@@ -62,31 +65,32 @@ class Motion:
 
     @property
     def rates(self) -> Array:
-        """(S + 1, D + F) all velocities."""
+        """All velocities (S + 1, D + F)."""
         return np.concatenate([self.v, self.afloat.rate], axis=1)
 
 
 class Instants:
-    """The instants of one motion that are looked at.
+    """Linearisation points of one motion.
 
     Args:
-        bench: lanes of the robot, as many as instants are looked at side by side.
-        system: the robot's.
-        motion: of which.
-        acting: effects that act in it, with coefficients (K, 1, 1).
-        outputs: names of MuJoCo's data and their columns that are read, beside the state.
+        bench: batch of the robot; its size is the number of points evaluated together.
+        system: system of the robot.
+        motion: the motion.
+        acting: effects active in it, with coefficients (K, 1, 1).
+        outputs: fields of MuJoCo's data and their columns that are read, in addition to the state.
         places: addresses of the joints.
-        drives: of each output the number of the joint of which it is what drives exert; -1 of
-            others.
-        held: seconds over which what is found at an instant holds.
+        drives: for each output, the number of the joint whose drive force it is; -1 for other
+            outputs.
+        held: interval of the linearisation in seconds.
 
     Attributes:
-        motion, acting: as given.
-        numbers: (N,) the steps that begin at them.
-        of: (S,) for each step which of them holds there.
-        every: steps between two of them while nothing changes in between.
-        seen: how many lanes have been placed so far.
-        remembering: numbers of the effects that remember, in the order of their columns of states.
+        motion: the given motion.
+        acting: the given effects.
+        numbers: (N,) steps that begin at the points.
+        of: (S,) index of the point that applies to each step.
+        every: number of steps between two points while no command changes.
+        seen: number of batch elements that have been placed so far.
+        remembering: numbers of the effects with hidden states, in the order of their state columns.
     """
 
     def __init__(
@@ -110,7 +114,8 @@ class Instants:
         self._dofs = np.append(places.velocities, self._floating.velocities)
         self.every = max(round(held / motion.step), 1)
         self.numbers, self.of = _looked_at(motion, self.every)
-        # What is bound after a call is not there before the next one.
+        # Fields must be bound before MuJoCo's first call, since later ones are not updated before
+        # the next call.
         self._bind(bench)
         self.seen = 0
         self._asked = [(e, c) for e, c in acting if is_asked(e)]
@@ -129,23 +134,24 @@ class Instants:
 
     @property
     def reads_drives(self) -> bool:
-        """Whether what a drive exerts is read."""
+        """Whether any output is a drive force."""
         return bool((self._drives >= 0).any())
 
     @property
     def reads_others(self) -> bool:
-        """Whether anything else is, beside the state."""
+        """Whether any output is not a drive force."""
         return bool((self._drives < 0).any())
 
     def reached(
         self, moved: Mapping[str, tuple[int, float]], acting: Acting, steps: int = 1
     ) -> tuple[Array, Array]:
-        """States (N, Z) and readings (N, O) after a step from each instant.
+        """Compute states (N, Z) and readings (N, O) after a step from each point.
 
         Args:
-            moved: one column of what it begins with, and by how much.
+            moved: perturbed column of the initial state or inputs, and the size of the
+                perturbation, by kind: ``q``, ``v``, ``a``, ``p``, ``r``, ``w``, ``f`` or ``u``.
             acting: effects whose elements are in the model.
-            steps: number of steps, of lanes with shorter ones.
+            steps: number of steps, for a batch with shorter ones.
         """
         states, readings = [], []
         bind, places, floating = self._bench.batch.bind, self._places, self._floating
@@ -167,7 +173,12 @@ class Instants:
         return np.concatenate(states), np.concatenate(readings)
 
     def accelerated(self, acting: Acting, more: Array | None = None) -> tuple[Array, Array]:
-        """Accelerations (N, E) at each instant, and readings (N, O); with more forces (N, E)."""
+        """Compute accelerations (N, E) and readings (N, O) at each point.
+
+        Args:
+            acting: effects whose elements are in the model.
+            more: (N, E) additional forces; none by default.
+        """
         accelerations, readings = [], []
         applied = self._bench.batch.bind("qfrc_applied")
         dofs, begin = self._dofs, 0
@@ -181,7 +192,7 @@ class Instants:
         return np.concatenate(accelerations), np.concatenate(readings)
 
     def _readings(self, n: int) -> Array:
-        """(n, O) of the lanes, as they are now."""
+        """Return readings (n, O) of the present state of the batch."""
         bind = self._bench.batch.bind
         rows = [bind(name)[:n, column, None] for name, column in self._outputs]
         if not rows:
@@ -195,7 +206,7 @@ class Instants:
     def _placed(
         self, moved: Mapping[str, tuple[int, float]], acting: Acting
     ) -> Iterator[tuple[int, Places | None]]:
-        """Put the lanes at the instants, batch after batch: how many there are, and which."""
+        """Place the points in the batch, part by part; yield number and indices of elements."""
         motion, places, floating = self.motion, self._places, self._floating
         count = self._bench.count
         self.seen += self.numbers.size
@@ -240,8 +251,12 @@ class Instants:
             yield n, None if n == count else np.arange(n)
 
     def _ask(self, at: Places, n: int, remembered: Mapping[int, float]) -> None:
-        """Add the forces of effects that hang on where the robot is, at the lanes' own states; what
-        some of them remember is moved, by their numbers.
+        """Add state-dependent effect forces at the states of the batch elements.
+
+        Args:
+            at: steps of the points.
+            n: number of batch elements in use.
+            remembered: perturbations of hidden states, by number of the effect.
         """
         if not self._asked:
             return
@@ -253,7 +268,7 @@ class Instants:
         t: Array = motion.step * at[:, None].astype(np.float64)
         carried = motion.carried[:, at]
         if any(effect.of in LOADED for effect, _ in self._asked):
-            # A servo's drive moves with the state as it does in the simulation.
+            # As in the simulation, a servo's force must follow the perturbed state.
             self._bench.batch.forward(None if n == self._bench.count else np.arange(n))
             carried = np.stack([bind(name)[:n, places.velocities] for name in SIDES])
         moment = moment_of(self._system, t, x, v, inputs, carried, self.stiff(at))
@@ -281,13 +296,13 @@ class Instants:
             self._bench.rub(n, int(places.velocities[joint]), np.maximum(limit, 0.0))
 
     def stiff(self, at: Places) -> Array:
-        """(n, D) of the servos, in some steps."""
+        """Return the stiffness (n, D) of the position servos, in some steps."""
         stiffness: Array = self._stiffness * self._working[at]
         return stiffness
 
     @contextmanager
     def on(self, bench: Bench) -> Iterator[None]:
-        """Look at the instants in other lanes, of the same coordinates."""
+        """Evaluate the points with another batch with equal coordinates."""
         own = self._bench, self._fresh
         if bench is not self._bench:
             self._bind(bench)
@@ -300,7 +315,7 @@ class Instants:
 
     @contextmanager
     def every_step(self) -> Iterator[None]:
-        """Look at every step, not only at those in which quotients are taken."""
+        """Evaluate every step, instead of the linearisation points only."""
         own = self.numbers
         self.numbers = np.arange(len(self.motion.controls))
         try:
@@ -310,7 +325,7 @@ class Instants:
 
     @contextmanager
     def limited_forces(self) -> Iterator[None]:
-        """Read the forces that the limits of stiff servos limit, in place of the outputs."""
+        """Read the forces with limits at stiff servos, instead of the outputs."""
         own = self._outputs, self._drives
         self._outputs = self._bench.force_limits.outputs
         self._drives = np.full(len(self._outputs), -1)
@@ -321,7 +336,7 @@ class Instants:
             self._outputs, self._drives = own
 
     def inertias(self) -> Array:
-        """(N, E, E) of all that moves at each instant that is looked at."""
+        """Compute the inertia matrices (N, E, E) at each point."""
         import mujoco
 
         self._bench.load(_repeated(self.acting, self._bench.count))
@@ -342,9 +357,16 @@ class Instants:
         return np.array(found)
 
     def shown(self, effect: Effect, c: Array, read: Array) -> Array:
-        """(N, O) what an effect in a drive changes about readings (N, O) of the drives."""
+        """Compute the changes of drive readings (N, O) by an effect in a drive.
+
+        Args:
+            effect: effect in a drive.
+            c: coefficients (K, 1, 1).
+            read: (N, O) readings without the effect.
+        """
         motion, at, of = self.motion, self.numbers, self._drives
-        # Of drives that are read it is known when the step begins, and not somewhere within.
+        # Drive forces that are read are known at the beginning of the step, so they replace the
+        # midpoint forces.
         carried = motion.carried[:, at].copy()
         carried[0][:, of[of >= 0]] = read[:, of >= 0]
         inputs = {name: u[at, None] for name, u in motion.inputs.items()}
@@ -356,7 +378,12 @@ class Instants:
         return result
 
     def force(self, effect: Effect, c: Array) -> Array:
-        """(S, D) what an effect exerts in the middle of each step."""
+        """Compute the forces (S, D) of an effect in the middle of each step.
+
+        Args:
+            effect: effect with a force, a friction or a hidden state.
+            c: coefficients (K, 1, 1).
+        """
         own = np.repeat(c, len(self.motion.controls), axis=1)
         if isinstance(effect, Hidden):
             state = self.gone(effect, c)
@@ -376,10 +403,10 @@ class Instants:
 
         It is that of MuJoCo's constraint for friction loss
         (https://mujoco.readthedocs.io/en/stable/computation/index.html, "Friction loss"). The
-        constraint asks for the acceleration -b v with b = 2 / (d_max timeconst), and yields by
-        R = A (1 - d) / d, with d its impedance and A the inverse inertia of the joint. With v the
-        velocity at the beginning of a step, a the acceleration over it, and the acceleration A f
-        that f itself makes, the force is
+        constraint has the reference acceleration -b v with b = 2 / (d_max timeconst), and the
+        regularisation R = A (1 - d) / d, with its impedance d and the inverse inertia A of the
+        joint. With the velocity v at the beginning of a step, the acceleration a over it, and the
+        acceleration A f by f itself, the force is
 
             f = -clip((a + b v + A f) / R, -limit, limit) = -clip(d (a + b v) / A, -limit, limit)
 
@@ -395,14 +422,14 @@ class Instants:
         return force
 
     def gone(self, effect: Effect, c: Array) -> State:
-        """States (S + 1, 1) of an effect along the motion, where it has any."""
+        """Integrate an effect's hidden state (S + 1, 1) along the motion; empty if it has none."""
         if not isinstance(effect, Hidden):
             return State(np.zeros((0, 1)), np.zeros((0, 1)))
         return along(effect, c, self.moment, self.motion.step)
 
     @cached_property
     def moment(self) -> RobotMoment:
-        """All instants of the motion as one moment of S lanes, in the middle of each step."""
+        """The whole motion as a snapshot of S batch elements, at the middle of each step."""
         motion = self.motion
         steps = len(motion.controls)
         t: Array = motion.step * (np.arange(float(steps)) + 0.5)
@@ -414,11 +441,13 @@ class Instants:
 
 
 def friction_damping(robot: Robot, dof: int) -> tuple[float, float]:
-    """Return the damping b (1/s) and the impedance d of MuJoCo's constraint for friction loss, in
-    the form in which effects add friction to the robot (`Instants._friction_force`).
+    """Return damping b (1/s) and impedance d of MuJoCo's constraint for friction loss.
+
+    They are those of the form in which effects add friction to the robot
+    (`Instants._friction_force`).
 
     Args:
-        robot: with the time step and the integrator in use.
+        robot: robot with the time step and the integrator in use.
         dof: index of the joint's velocity.
     """
     import mujoco
@@ -430,7 +459,7 @@ def friction_damping(robot: Robot, dof: int) -> tuple[float, float]:
     timeconst, ratio = (float(value) for value in solref)
     limits = np.clip(solimp[:2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     (at_rest, largest), width = limits.tolist(), float(solimp[2])
-    # Friction has no violation; where the impedance is constant, MuJoCo takes the mean.
+    # Friction has no constraint violation. For a constant impedance, MuJoCo takes the mean.
     d = at_rest if width > mujoco.mjMINVAL else 0.5 * (at_rest + largest)
     if timeconst <= 0:
         return -ratio / largest, d
@@ -440,12 +469,20 @@ def friction_damping(robot: Robot, dof: int) -> tuple[float, float]:
 
 
 def _looked_at(motion: Motion, every: int) -> tuple[Places, Places]:
-    """Steps in which quotients are taken (N,), and for each step which of them hold there (S,)."""
+    """Choose the linearisation points.
+
+    Args:
+        motion: the motion.
+        every: regular number of steps between two points.
+
+    Returns:
+        Steps of the points (N,), and for each step the index of the point that applies (S,).
+    """
     steps = len(motion.controls)
     changes = np.ones(steps, dtype=bool)
     changes[1:] = (np.diff(motion.controls, axis=0) != 0).any(axis=1)
-    # A command that holds for a while is looked at anew when it changes; one that never holds is
-    # as smooth as the motion.
+    # A new point begins when a piecewise constant command changes. A command that changes in almost
+    # every step is as smooth as the motion and needs no extra points.
     if changes.mean() > 1.0 / every:
         changes[1:] = False
     changes[1:] |= (motion.off[1:] != motion.off[:-1]).any(axis=1)
@@ -456,5 +493,5 @@ def _looked_at(motion: Motion, every: int) -> tuple[Places, Places]:
 
 
 def _repeated(acting: Acting, count: int) -> Acting:
-    """One lane's coefficients for all lanes of a batch; of native effects alone."""
+    """Repeat the coefficients of model-field effects for all elements of a batch."""
     return tuple((e, np.repeat(c, count, axis=1)) for e, c in natives(acting))

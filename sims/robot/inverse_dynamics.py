@@ -1,4 +1,4 @@
-"""Forces at a robot's joints by MuJoCo's inverse dynamics along a measured motion."""
+"""Joint forces along a measured motion, by MuJoCo's inverse dynamics."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from sims.robot.model import Joint
 
 
 class MotionForces(NamedTuple):
-    """Forces at J joints at T instants, (T, J) each.
+    """Forces at J joints at T times, (T, J) each.
 
     Attributes:
-        needed: what the motion needs beside gravity and passive forces.
-        driven: what the actuators of the model exert.
+        needed: forces that the motion requires by inverse dynamics, in addition to gravity and the
+            passive forces of the model.
+        driven: forces that the actuators of the model exert.
     """
 
     needed: Array
@@ -30,15 +31,19 @@ def motion_forces(
     controls: Array,
     activations: Array | None = None,
 ) -> MotionForces:
-    """Compute the forces of a motion by inverse dynamics; other joints rest where the model has
-    them.
+    """Compute the joint forces of a motion by inverse dynamics.
+
+    Joints that are not in `joints` rest in the reference pose of the model.
 
     Args:
-        model: compiled model of MuJoCo.
+        model: compiled mujoco.MjModel.
         joints: J joints with one coordinate each.
-        motion: (3, T, J) their positions, velocities and accelerations.
+        motion: (3, T, J) positions, velocities and accelerations of the joints.
         controls: (T, nu) controls of all actuators.
         activations: (T, na) activations of all actuators; zero if None.
+
+    Returns:
+        The required forces and the actuator forces, (T, J) each.
     """
     import mujoco
 

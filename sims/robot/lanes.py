@@ -1,9 +1,8 @@
-"""Many lanes of one robot in MuJoCo: `mujoco.batch.Batch`, with the model fields that effects
-write.
+"""Batch of MuJoCo simulations of one robot, on `mujoco.batch.Batch`, with model fields for effects.
 
-A lane's fields begin as the file states them; what acts in the lane is written into them. Fields
-from which MuJoCo derives others (masses) go into a batch of their own, so that lanes without such a
-change keep the very constants of the file.
+The fields of each batch element are initialised from the model file, and effects are written into
+them. Fields from which MuJoCo derives others (masses) have a separate batch, so that simulations
+without such a change keep exactly the constants of the file.
 """
 
 from __future__ import annotations
@@ -29,24 +28,27 @@ from sims.robot.switched_off import FORCE_FIELDS, ForceRanges, constant_stretche
 from sims.system import Acting
 
 LANES = 64
-"""Of a batch: of more, what is held for them leaves the processor's cache."""
+"""Batch size; the data of a larger batch exceed the processor cache."""
 SIZES = (1, 8, LANES)
-"""Lanes that a batch is made for."""
+"""Available batch sizes."""
 INTERRUPTED = 40_000
-"""Steps of all lanes together in one call: a fraction of a second, after which Ctrl-C is heard."""
+"""Maximum number of steps, summed over batch elements, in one call.
+
+A call then takes a fraction of a second, after which Ctrl-C is handled.
+"""
 
 
 class Addresses:
-    """Where the joints of one coordinate stand in MuJoCo's vectors.
+    """Addresses of joints with one coordinate in MuJoCo's vectors.
 
     Attributes:
-        positions: (D,) in qpos.
-        velocities: (D,) in qvel.
+        positions: (D,) addresses in qpos.
+        velocities: (D,) addresses in qvel.
 
     Args:
-        robot: whose.
-        series: which joints: those of the robot's file, or those put in series with them.
-        both: or those of the file, then those in series.
+        robot: robot with the joints.
+        series: select the joints in series instead of those of the robot's file.
+        both: select the joints of the file, followed by those in series.
     """
 
     def __init__(self, robot: Robot, series: bool = False, both: bool = False) -> None:
@@ -59,30 +61,30 @@ class Addresses:
 
 
 class Asked(Protocol):
-    """Effects that are asked for their forces in every step, as `sims.robot.forces.Forces`."""
+    """Effects whose forces are evaluated in every step, such as `sims.robot.forces.Forces`."""
 
     rubs: Mask
     addresses: Addresses
     loaded: Mask
 
     def at(self, k: int, look: Look) -> tuple[Array, Array]:
-        """Forces and limits of dry friction over step k."""
+        """Compute forces and limits of dry friction over step k."""
         ...
 
 
 DRIVE = "simgap.drive."
-"""Beginning of the names of sensors that are added to a model."""
+"""Prefix of the names of sensors that are added to a model."""
 
 
 def read_model(robot: Robot, derived: bool) -> Any:
-    """The compiled model of lanes, with a sensor of what actuators exert on each joint.
+    """Compile the model of a batch, with a sensor of the actuator force on each joint.
 
-    A sensor shows the instant at which a step begins, whatever the integrator; MuJoCo's data would
-    show the last of the instants that it looked at.
+    A sensor shows the beginning of a step for every integrator. MuJoCo's data would contain the
+    last evaluation of the integrator.
 
     Args:
-        robot: whose.
-        derived: whether masses and centres of mass change lane by lane.
+        robot: robot to simulate.
+        derived: whether masses and centres of mass differ between batch elements.
     """
     import mujoco
 
@@ -99,14 +101,19 @@ def read_model(robot: Robot, derived: bool) -> Any:
 
 
 def drives(model: Any, robot: Robot) -> dict[str, int]:
-    """Where in its sensors' data a model of lanes has what actuators exert, by joint."""
+    """Return the addresses of actuator forces in the sensor data of a batch model, by joint."""
     own = [joint.name for joint in robot.joints if joint.single]
     singles = [name for name in own if name not in robot.series]
     return {name: int(model.sensor(DRIVE + name).adr[0]) for name in singles}
 
 
 def stepped(robot: Robot, settings: Mapping[str, float]) -> Robot:
-    """The robot with options of its model other than the file's; itself where they are the same."""
+    """Return the robot with other options of its model; the robot itself if they are equal.
+
+    Args:
+        robot: robot with the model file.
+        settings: options by name, such as ``timestep``.
+    """
     option = robot.compiled.opt
     if all(getattr(option, name) == value for name, value in settings.items()):
         return robot
@@ -117,22 +124,22 @@ def stepped(robot: Robot, settings: Mapping[str, float]) -> Robot:
 
 
 class Bench:
-    """Up to `LANES` simulations of a robot side by side.
+    """Batch of simulations of a robot.
 
     Attributes:
-        fields: model fields of the lanes, (LANES, ...) by name, as they are.
+        fields: present model fields of the batch elements, (LANES, ...) by name.
         batch: the mujoco.batch.Batch.
         places: addresses of the joints of the robot's file.
-        second: those of joints in series with them.
-        whole: all of these, in this order.
-        floating: bodies that float or turn on balls.
-        drives: columns of the sensors' data that show what actuators exert, by joint.
+        second: addresses of the joints in series with them.
+        whole: addresses of all these joints, in this order.
+        floating: free and ball joints.
+        drives: columns of the sensor data with actuator forces, by joint.
 
     Args:
-        robot: whose.
+        robot: robot to simulate.
         derived: whether masses or armatures change, from which MuJoCo derives constants.
-        settings: of the options: timestep (seconds), integrator (its number).
-        count: how many lanes there are.
+        settings: options of the model: timestep (seconds), integrator (its number).
+        count: batch size.
     """
 
     def __init__(
@@ -141,7 +148,7 @@ class Bench:
         import mujoco
         from mujoco import batch
 
-        # What effects write hangs on the step: they shall find the one that is made.
+        # Fields that effects write depend on the time step, so it is set first.
         self.robot = robot = stepped(robot, settings)
         self.derived = derived
         self.count = count
@@ -149,10 +156,10 @@ class Bench:
         self.whole = Addresses(robot, both=True)
         self.floating = Floating.of(robot)
         model = read_model(robot, derived)
-        # A lane that fails must be NaN: MuJoCo would reset it, and it would pass for done.
+        # A failed simulation must become NaN; an automatic reset by MuJoCo would hide the failure.
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         if not contacts.possible(model):
-            # Looking for what cannot be is a third of a step of one joint.
+            # Collision detection without possible contacts takes a third of a step of one joint.
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self.drives = drives(model, robot)
         self.batch: Any = batch.Batch(model, count, 1)
@@ -170,7 +177,7 @@ class Bench:
 
     @property
     def model(self) -> Any:
-        """The mujoco.MjModel that lanes share but for their fields."""
+        """The mujoco.MjModel that the batch elements share, except for their fields."""
         return self.batch.model
 
     @cached_property
@@ -180,12 +187,12 @@ class Bench:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the model that the batch copies, and of the lanes' own fields and states."""
+        """Memory in bytes of the batch's model, and of its elements' fields and states."""
         own = [*self.fields.values(), *self._stated.values(), self.batch.state]
         return int(self.model.nbuffer + sum(values.nbytes for values in own))
 
     def load(self, acting: Acting) -> None:
-        """Write the native effects, with coefficients (K, LANES, 1), into the lanes' fields."""
+        """Write model-field effects, with coefficients (K, LANES, 1), into the batch's fields."""
         for name in self._changed:
             self.fields[name][...] = self._stated[name]
         was_derived = any(self._derives(name) for name in self._changed)
@@ -199,7 +206,7 @@ class Bench:
             self._changed.update(native.fields)
             derives = derives or native.derived
         if self.robot.series:
-            # After the armatures, of which each takes its own part.
+            # This follows the armature effects, since each drive takes its share of the armature.
             in_series(self.fields, self.robot, acting)
             self._changed.update(WRITTEN)
         if derives:
@@ -213,9 +220,16 @@ class Bench:
         return any(field in native.fields and native.derived for native in FIELDS.values())
 
     def begin(self, positions: Array, velocities: Array, afloat: Afloat) -> tuple[Array, Array]:
-        """Put the lanes at their initial states, (n, D) each, of the file's joints, and of what
-        floats; returns where joints in series begin (n, H): where the links hang while their drives
-        are held.
+        """Set the initial states of the first n batch elements.
+
+        Args:
+            positions: (n, D) positions of the joints of the file.
+            velocities: (n, D) velocities of the joints of the file.
+            afloat: poses and velocities of floating bodies.
+
+        Returns:
+            Initial positions and velocities (n, H) of joints in series: the equilibrium of the
+            links while their drives are held, at rest.
         """
         self.batch.reset(stage=0)
         qpos, qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
@@ -235,7 +249,7 @@ class Bench:
         return begun, np.zeros_like(begun)
 
     def spread(self, forces: Array) -> Array:
-        """Generalised forces (..., nv) of the file's model as this one has them."""
+        """Map generalised forces (..., nv) of the file's model to this batch's model."""
         if self.model.nv == forces.shape[-1]:
             return forces
         own = np.setdiff1d(np.arange(self.model.nv), self.second.velocities)
@@ -244,23 +258,23 @@ class Bench:
         return result
 
     def activate(self, activations: Array) -> None:
-        """Put the actuators of n lanes at their first activations (n, na)."""
+        """Set the initial activations (n, na) of the first n batch elements."""
         if self.model.na:
             self.batch.bind("act")[: len(activations)] = activations
 
     def run(
         self, controls: Array, forces: Array, record: Sequence[str], off: Mask | None = None
     ) -> dict[str, Array]:
-        """Step n lanes S times.
+        """Step n batch elements S times.
 
         Args:
-            controls: (n, S, nu).
+            controls: (n, S, nu) controls.
             forces: (n, S, nv) generalised forces.
-            record: fields of MuJoCo's data.
-            off: (n, S, K) which actuators are switched off.
+            record: fields of MuJoCo's data to record.
+            off: (n, S, K) whether each actuator is switched off; none is by default.
 
         Returns:
-            What is recorded, (n, S, ...) by name.
+            Recorded fields (n, S, ...) by name.
         """
         import mujoco
 
@@ -282,7 +296,7 @@ class Bench:
         return result
 
     def _switched(self, n: int, steps: int, off: Mask | None) -> Iterator[slice]:
-        """Yield the parts of `_parts` after another, with actuators that are off switched off."""
+        """Yield consecutive parts of all steps, while actuators that are off are switched off."""
         if off is None or not off.any():
             yield from self._parts(n, steps)
             return
@@ -294,9 +308,7 @@ class Bench:
         ranges.restore()
 
     def force_ranges(self) -> ForceRanges:
-        """Return the force ranges of the lanes, to switch actuators off until they are loaded
-        again.
-        """
+        """Return the force ranges of the batch, to switch actuators off until the next `load`."""
         self._changed.update(FORCE_FIELDS)
         return ForceRanges(self.fields)
 
@@ -308,14 +320,17 @@ class Bench:
         record: Sequence[str],
         off: Mask | None = None,
     ) -> dict[str, Array]:
-        """The same where effects are asked for their forces in every step.
+        """Step n batch elements S times with effects that are evaluated in every step.
 
         Args:
-            controls: as in `run`.
-            forces: likewise.
-            asking: the effects.
-            record: likewise.
-            off: likewise.
+            controls: (n, S, nu) controls.
+            forces: (n, S, nv) generalised forces.
+            asking: effects to evaluate.
+            record: fields of MuJoCo's data to record.
+            off: (n, S, K) whether each actuator is switched off; none is by default.
+
+        Returns:
+            Recorded fields (n, S, ...) by name.
         """
         n, steps, _ = controls.shape
         dofs = asking.addresses.velocities
@@ -325,14 +340,15 @@ class Bench:
         own = loss[:n, dofs].copy()
         rubs = bool(asking.rubs.any())
         if rubs:
-            # Where no effect adds friction, that of the file keeps its solver parameters.
+            # Where no effect adds friction, the file's friction keeps its solver parameters.
             lanes, joints = np.nonzero(asking.rubs)
             write_friction_form(self.fields, self.robot, lanes, dofs[joints])
             self._changed.update(FIELDS["friction.coulomb"].fields)
         result = self._begun(n, steps, record)
         shown = {name: bind(name)[:n] for name in record}
         ids = self._ids(n)
-        # Before MuJoCo looks for the first time: what is bound later would not show it.
+        # This precedes MuJoCo's first evaluation, since fields that are bound later would not
+        # contain it.
         lanes_at = Midway(self.batch, asking.addresses.positions, dofs, asking.loaded)
         changes: Mask = np.any(np.diff(controls, axis=1, prepend=controls[:, :1]) != 0, axis=2)
         of = lanes_at.of
@@ -365,8 +381,13 @@ class Bench:
         return result
 
     def stiffness(self, places: Addresses) -> Array:
-        """(LANES, D) what position servos exert for each unit of their errors, as the lanes are
-        loaded; zero of joints without one.
+        """Return the force of position servos per unit of their errors, with effects.
+
+        Args:
+            places: addresses of D joints.
+
+        Returns:
+            (LANES, D) stiffness; zero for joints without a position servo.
         """
         robot = self.robot
         result = np.zeros((self.count, len(places.velocities)))
@@ -379,8 +400,14 @@ class Bench:
         return result
 
     def rub(self, n: int, dof: int, limit: Array) -> None:
-        """Add dry friction of at most `limit` (n,) to what was loaded, in the first n lanes, at the
-        joint whose velocity has the index `dof`; what was added before is replaced.
+        """Add dry friction at one joint to the loaded friction of the first n batch elements.
+
+        Friction that was added before is replaced.
+
+        Args:
+            n: number of batch elements.
+            dof: index of the joint's velocity.
+            limit: (n,) friction limits to add.
         """
         loss = self.fields["dof_frictionloss"]
         changed = FIELDS["friction.coulomb"].fields
@@ -390,19 +417,19 @@ class Bench:
         write_friction_form(self.fields, self.robot, slice(n), dof)
 
     def _begun(self, n: int, steps: int, record: Sequence[str]) -> dict[str, Array]:
-        """Arrays that will hold what is recorded."""
+        """Allocate arrays for recorded fields."""
         return {name: np.empty((n, steps, *self.batch.bind(name).shape[1:])) for name in record}
 
     def _ids(self, n: int) -> Places | None:
         return None if n == self.count else np.arange(n)
 
     def _fails(self, n: int) -> None:
-        """What warns stands still from then on: it has failed."""
+        """Record which batch elements have failed: MuJoCo no longer moves those with a warning."""
         self.failed = (self.batch.warning[:n, :, 1] > 0).any(axis=1)
 
     @staticmethod
     def _parts(lanes: int, steps: int) -> Iterator[slice]:
-        """Steps in stretches of a fraction of a second, after which Ctrl-C is heard."""
+        """Yield parts of all steps that take a fraction of a second, to allow Ctrl-C between."""
         largest = max(INTERRUPTED // max(lanes, 1), 1)
         for begin in range(0, steps, largest):
             yield slice(begin, min(begin + largest, steps))

@@ -1,6 +1,4 @@
-"""What effects would change about a robot's runs, to first order (`sims.robot.tangent`), as its
-sensors would show it.
-"""
+"""First-order responses of a run's observations to effects (`sims.robot.tangent`)."""
 
 from __future__ import annotations
 
@@ -30,25 +28,25 @@ from sims.system import Acting, Effect, Input, Sensor
 Added = tuple[Effect, Array]
 """An effect with its coefficients (k,)."""
 BY_FORCE = frozenset({"drag.linear", "drag.quadratic", "friction.coulomb"})
-"""Effects in MuJoCo's model whose force is that of the library, so that it is asked there."""
+"""Model-field effects whose force the effect library computes as well, so that it is used here."""
 SPRINGS = frozenset({"spring.linear", "spring.cubic"})
-"""The same where the joint's spring rests at zero."""
+"""Model-field effects whose force the library computes if the joint's spring rests at zero."""
 
 
 class Linear:
-    """The neighbourhood of one run of a robot.
+    """Linearisation of one run of a robot.
 
     Args:
-        simulator: the robot's.
+        simulator: simulator of the robot.
         theta: (dim,) parameters.
-        scenario: of the run.
+        scenario: scenario of the run.
         x: (D,) initial positions.
         v: (D,) initial velocities.
 
     Attributes:
-        held: seconds over which difference quotients hold.
-        quotients: difference quotients of another motion nearby, to be used again.
-        observed: (T, C) the observations of the run.
+        held: time in seconds for which difference quotients are reused.
+        quotients: difference quotients of another motion nearby, to be reused.
+        observed: (T, C) observations of the run.
     """
 
     held = HELD
@@ -74,11 +72,11 @@ class Linear:
         nothing = np.zeros((1, *self._motion.x.shape[:1], self._tangent.size))
         unread = np.zeros((1, self._motion.x.shape[0], len(self._names)))
         self.observed: Array = self._seen(nothing, unread, [()])[0]
-        # Numbers of the joints of the file among all: those in series stand behind them.
+        # The joints of the file come first; joints in series follow them.
         self._joints = len(simulator.addresses.positions)
 
     def _nominal(self) -> Motion:
-        """The motion itself, with one step more than the run takes, whose beginning is its end."""
+        """Simulate the motion of the run, plus one step that begins at the run's end."""
         simulator = self._simulator
         steps = self._steps + 1
         given = simulator.controls(self._work, steps)
@@ -115,7 +113,7 @@ class Linear:
         }
 
     def _afloat(self, fields: Mapping[str, Array]) -> Afloat:
-        """What floats, at the beginnings of steps and at the end."""
+        """Return states of floating bodies, at the beginnings of steps and at the end."""
         begun = self._simulator.begins_afloat(self._work)
         floating = self._simulator.wide(self._work.acting).floating
         pose = fields["qpos"][0][:, floating.positions]
@@ -129,7 +127,7 @@ class Linear:
         outputs = [("sensordata", simulator.column(name)) for name in self._names]
         bench = simulator.wide(self._work.acting)
         sizes = scales(simulator.robot).force
-        # What is in series carries what its joint carries.
+        # A joint in series transmits the force of its joint.
         second = [self._joint(name) for name in bench.robot.series]
         at = Instants(
             bench,
@@ -145,21 +143,29 @@ class Linear:
         return Tangent(at, sizes, self.quotients)
 
     def _driven_joint(self, channel: str) -> int:
-        """The number of the joint of which a channel shows what drives exert; -1 of others."""
+        """Return the number of the joint whose drive force a channel observes; -1 if none."""
         kind, _, joint = channel.partition(".")
         return self._simulator.system.coordinates.index(f"q.{joint}") if kind == "tau" else -1
 
     def _joint(self, second: str) -> int:
-        """The number of the joint with which one is in series."""
+        """Return the number of the joint with which a joint is in series."""
         coordinates = self._simulator.system.coordinates
         return coordinates.index(f"q.{second.rpartition('_')[0]}")
 
     def responses(self, added: Sequence[Added]) -> tuple[Array, int]:
-        """(K, T, C): what each of these effects changes about the run's observations; and how many
-        simulations of the run it takes, about, with the neighbourhood itself.
+        """Compute the changes of the run's observations by each effect, to first order.
+
+        Effects in series with joints have no small size, so they are simulated.
+
+        Args:
+            added: effects with their coefficients.
+
+        Returns:
+            (K, T, C) changes of the observations, and the approximate cost as a number of
+            simulations of the run, including the linearisation itself.
         """
         before = self._tangent.looks - self._built
-        # What it costs is the same whatever was asked before.
+        # The cost must not depend on earlier calls.
         self._known.clear()
         result = np.zeros((len(added), *self.observed.shape))
         driven = self._driven(added)
@@ -181,7 +187,7 @@ class Linear:
                         continue
                     changes += self._changes(owner, one, k)
                 changes += [c._replace(owner=owner) for c in driven.get(number, ())]
-            # A change that grows beyond all numbers is none that a fit could follow.
+            # A change that overflows is one that a fit could not follow.
             with np.errstate(all="ignore"):
                 states, readings = self._tangent.follow(changes, len(part))
                 seen = self._seen(states, readings, sensors)
@@ -191,8 +197,9 @@ class Linear:
         return result, 1 + len(apart) + looks // len(self._motion.controls)
 
     def _simulated(self, added: Sequence[Added]) -> Array:
-        """(K, T, C) observations of the run with each of these effects beside its own, or for those
-        that it contains: what has no small size is simulated.
+        """Simulate observations (K, T, C) of the run with each effect added.
+
+        An added effect replaces the simpler effects of the run that it contains.
         """
         count, work = len(added), self._work
         acting = [(e, np.repeat(c, count, axis=1)) for e, c in work.acting]
@@ -208,10 +215,10 @@ class Linear:
         return self._simulator.observed(work._replace(acting=tuple(acting), x=lanes[0], v=lanes[1]))
 
     def begun(self) -> Array:
-        """(2 D, T, C): what each initial position, then each velocity, changes, per unit."""
+        """Compute observation derivatives (2 D, T, C) by initial positions, then velocities."""
         with np.errstate(all="ignore"):
             states, readings = self._tangent.begun()
-        # Small enough to be linear in what sensors do.
+        # The changes are small enough for nonlinear sensor effects to be linear.
         small = 1e-4
         seen = self._seen(small * states, small * readings, [()] * len(states))
         result: Array = (seen - self.observed) / small
@@ -219,7 +226,7 @@ class Linear:
         return np.concatenate([result[:own], result[half : half + own]])
 
     def _changes(self, owner: int, effect: Effect, c: Array) -> list[Change]:
-        """What an effect that is neither of an input nor of a sensor changes in each step."""
+        """Return the perturbations by an effect that acts on neither inputs nor sensors."""
         name = effect.of or effect.name
         joint = effect.coordinate
         if name == "inertia.armature" and joint is not None:
@@ -243,7 +250,7 @@ class Linear:
         return bool(rest == 0.0)
 
     def _driven(self, added: Sequence[Added]) -> dict[int, list[Change]]:
-        """The changes of effects on inputs, by number: what each feels in place of what is felt."""
+        """Return the changes of applied inputs by input effects, by number of the effect."""
         rows: list[tuple[int, Effect, Array]] = []
         for number, (effect, c) in enumerate(added):
             for one, k in effect.parts(c[:, None, None]):
@@ -280,7 +287,13 @@ class Linear:
         return result
 
     def _seen(self, states: Array, readings: Array, sensors: Sequence[Acting]) -> Array:
-        """(n, T, C) observations of the motion changed by these, through these sensors besides."""
+        """Compute observations (n, T, C) of the perturbed motion, with further sensor effects.
+
+        Args:
+            states: (n, S, Z) changes of the states at the beginnings of steps.
+            readings: (n, S, M) changes of the sensor readings.
+            sensors: further sensor effects of each of the n batch elements.
+        """
         simulator, count = self._simulator, len(states)
         upto = self._steps + 1
         size = self._motion.x.shape[1]
@@ -289,7 +302,7 @@ class Linear:
         at_ends = places(simulator.step, self._times, upto)
         for channel in simulator.channels:
             acting = _on(channel.name, own, sensors)
-            # Of most channels only some instants are ever shown.
+            # Most channels are needed at the sample times only.
             some = at_ends if keeps_time(acting) else None
             rows: slice | NDArray[np.intp] = slice(upto) if some is None else some
             kind, _, of = channel.name.partition(".")
@@ -313,7 +326,7 @@ class Linear:
 
 
 def _on(channel: str, own: Acting, more: Sequence[Acting]) -> Acting:
-    """The sensors on a channel: the motion's own, then each lane's."""
+    """Return the sensor effects on a channel: those of the motion, then the additional ones."""
     acting = [(e, c) for e, c in own if isinstance(e, Sensor) and e.signal in ("", channel)]
     added: dict[str, tuple[Effect, Array]] = {}
     for lane, parts in enumerate(more):

@@ -1,4 +1,4 @@
-"""Inertia and shapes of a URDF's links, made fit for MuJoCo."""
+"""Repair inertias and shapes of URDF links for MuJoCo."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from sims.robot.xmlfile import Files, children
 
 ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 LIGHT = 1e-6
-"""kg below which a link is a frame, whose inertia is not worth a word."""
+"""Mass, in kg, below which a link counts as a mere frame, whose inertia needs no note."""
 FOLDERS = ("meshdir", "assetdir", "texturedir", "strippath", "discardvisual")
-"""Settings of MuJoCo's compiler that meshes are found by here."""
+"""Settings of MuJoCo's compiler about mesh files, which are removed after the meshes were found."""
 
 
 def number(text: str | None) -> float:
-    """The number; 0 where there is none, NaN where it is not one."""
+    """Parse a number; 0 for a missing text, NaN for an invalid one."""
     try:
         return float(text) if text else 0.0
     except ValueError:
@@ -30,21 +30,24 @@ def number(text: str | None) -> float:
 
 
 def mass(link: Element) -> float:
-    """What a link states, kg; 0 where it states none."""
+    """Return the mass that a link specifies, in kg; 0 if it specifies none."""
     stated = children(link, "inertial", "mass")
     return number(stated[0].get("value")) if stated else 0.0
 
 
 def inertials(files: Files, links: Mapping[str, Element], held: set[str]) -> list[str]:
-    """Mend masses and moments of inertia.
+    """Repair masses and moments of inertia.
 
     Args:
-        files: what has been read.
-        links: by name; changed.
-        held: those that are fused to the world, of which nothing need be said.
+        files: reader of the model file.
+        links: link elements by name; changed in place.
+        held: links that are fused to the world, which need no notes.
+
+    Returns:
+        Notes about the repairs.
 
     Raises:
-        InputError: a mass is negative, or an entry is no number.
+        InputError: a mass is negative, or an entry is not a number.
     """
     points, raised, inferred = [], [], []
     for name, link in links.items():
@@ -70,7 +73,7 @@ def inertials(files: Files, links: Mapping[str, Element], held: set[str]) -> lis
 
 
 def _raised(tensor: Element, entries: Sequence[float]) -> str:
-    """Raise principal moments that are not positive; says what was changed."""
+    """Raise principal moments that are not positive; return a text about the change."""
     moments, axes = inertia.principal(entries)
     if moments[0] >= inertia.NONE:
         return ""
@@ -101,16 +104,19 @@ def _said(points: list[str], raised: list[str], inferred: list[str]) -> list[str
 def shapes(
     files: Files, links: Mapping[str, Element], compiler: Element, held: set[str]
 ) -> list[str]:
-    """Leave out what is only seen, and shapes whose mesh is absent or of another format.
+    """Remove visual shapes, and collision shapes whose mesh is missing or of an unsupported format.
 
     Args:
-        files: what has been read.
-        links: by name; changed.
-        compiler: the settings of MuJoCo's compiler; changed.
+        files: reader of the model file.
+        links: link elements by name; changed in place.
+        compiler: settings of MuJoCo's compiler; changed in place.
         held: links that are fused to the world, whose mass does not matter.
 
+    Returns:
+        Notes about the omitted shapes.
+
     Raises:
-        InputError: the mass of a link that moves would follow from an absent mesh.
+        InputError: the mass of a moving link would depend on a missing mesh.
     """
     meshes = Meshes(files, compiler.get("meshdir") or compiler.get("assetdir") or "")
     inferring = compiler.get("inertiafromgeom") == "true"
@@ -127,7 +133,7 @@ def shapes(
 
 
 def _kept(files: Files, name: str, shape: Element, meshes: Meshes, stated: bool) -> bool:
-    """Whether a collision shape can be read; its mesh is called by where it lies."""
+    """Return whether a collision shape can be read, and set the path of its mesh."""
     for mesh in children(shape, "geometry", "mesh"):
         file = mesh.get("filename") or ""
         found, why = meshes.find(file)

@@ -1,4 +1,4 @@
-"""Joints that constraints couple: those of a closed loop, and those of an equality of joints."""
+"""Joints coupled by constraints: joints of a closed loop, and joints of a joint equality."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from typing import Any
 def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
     """Return the groups of joints that constraints of a MuJoCo model couple.
 
-    A `connect` or `weld` couples the joints between its bodies and their common ancestor; an
-    equality of joints couples these.
+    A `connect` or `weld` constraint couples the joints between its two bodies and their common
+    ancestor. A joint equality couples its two joints.
 
     Args:
-        model: MuJoCo's.
-        dofs: degree of freedom of each joint.
+        model: the mujoco.MjModel.
+        dofs: index of the degree of freedom of each joint.
 
     Returns:
-        Sets of numbers of joints, each of two at least; sets that share a joint are one.
+        Sets of joint numbers (indices into `dofs`), each with at least two joints. Sets that share
+        a joint are merged.
     """
     import mujoco
 
@@ -44,7 +45,7 @@ def coupled_joints(model: Any, dofs: Sequence[int]) -> list[set[int]]:
 
 
 def _ancestors(model: Any, body: int) -> list[int]:
-    """A body and all bodies between it and the world."""
+    """Return a body and all its ancestors, including the world."""
     found = [body]
     while body > 0:
         body = int(model.body_parentid[body])

@@ -1,6 +1,4 @@
-"""XML as text that a person wrote: elements with the places where they stand, so that attributes
-and comments change and every other character stays.
-"""
+"""Edit XML text in place: attributes and comments change, and all other characters are kept."""
 
 from __future__ import annotations
 
@@ -15,27 +13,27 @@ _ATTRIBUTE = re.compile(rb"(\s+)([\w:.-]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 
 
 class UnfitError(Exception):
-    """A text that cannot be changed this way; says why, as a clause."""
+    """A text cannot be edited in this way; the message states the reason as a clause."""
 
 
 @dataclass(eq=False)
 class Tag:
-    """An element, and what is to change in it.
+    """An XML element and the changes to make in it.
 
     Attributes:
-        name: of the element.
-        attributes: as they were read.
-        begin: of its start tag, bytes.
-        inside: where its start tag ends.
-        end: where its end tag begins; as `inside` where it has none.
-        children: in the order of the text.
-        new: new values by attribute.
-        removed: attributes that go.
-        renamed: its new name.
-        before: comments that are to stand before it.
-        within: elements, with their comments, that are to be its first.
-        after: elements that are to stand behind it.
-        text: of another file, to stand in its place.
+        name: name of the element.
+        attributes: attributes as read.
+        begin: byte offset at which its start tag begins.
+        inside: byte offset at which its start tag ends.
+        end: byte offset at which its end tag begins; equal to `inside` if it has none.
+        children: child elements in the order of the text.
+        new: new attribute values.
+        removed: attributes to remove.
+        renamed: new name of the element.
+        before: comments to insert before it.
+        within: elements with comments to insert as its first children.
+        after: elements to insert after it.
+        text: text that replaces the element.
     """
 
     name: str
@@ -54,28 +52,28 @@ class Tag:
 
     @property
     def changed(self) -> bool:
-        """Whether anything in it or below it changes."""
+        """Whether the element or any of its descendants has changes."""
         own = self.new or self.removed or self.renamed or self.before or self.within
         return bool(own or self.after) or any(child.changed for child in self.children)
 
     def says(self, name: str) -> str | None:
-        """The value of an attribute."""
+        """Return the value of an attribute, including changes; None if it is missing."""
         if name in self.new:
             return self.new[name]
         return None if name in self.removed else self.attributes.get(name)
 
     def walk(self) -> Iterator[Tag]:
-        """It and all below it, in the order of the text."""
+        """Yield the element and all its descendants, in the order of the text."""
         yield self
         for child in self.children:
             yield from child.walk()
 
 
 class Markup:
-    """A text of XML.
+    """An XML text with its elements.
 
     Raises:
-        UnfitError: it is no XML in UTF-8, or declares entities.
+        UnfitError: the text is not XML in UTF-8, or has a document type.
     """
 
     def __init__(self, text: bytes, path: Path) -> None:
@@ -90,12 +88,12 @@ class Markup:
             self._parser.Parse(text, True)
         except expat.ExpatError as error:
             raise UnfitError(f"{path.name} is no XML in UTF-8 ({error})") from None
-        # The newlines that the file has.
+        # Inserted lines end like those of the file.
         self._newline = b"\r\n" if b"\r\n" in text else b"\n"
 
     @property
     def root(self) -> Tag:
-        """The outermost element."""
+        """Root element."""
         assert self._top is not None, "well-formed XML has one"
         return self._top
 
@@ -117,11 +115,11 @@ class Markup:
             tag.end = self._parser.CurrentByteIndex
 
     def _closed(self, tag: Tag) -> bool:
-        """Whether its start tag is its end as well."""
+        """Return whether an element has a self-closing tag."""
         return self.text[tag.inside - 2 : tag.inside] == b"/>"
 
     def _end_of(self, begin: int) -> int:
-        """Where a start tag ends: at the first > outside of quotes."""
+        """Return the offset after a start tag, at the first ``>`` outside of quotes."""
         quote = b""
         for i in range(begin, len(self.text)):
             one = self.text[i : i + 1]
@@ -134,11 +132,11 @@ class Markup:
         raise UnfitError(f"{self.path.name} ends within a tag")
 
     def inner(self) -> bytes:
-        """What stands in the outermost element, with all changes."""
+        """Return the content of the root element, with all changes."""
         return self._written(self.root.inside, self.root.end, self.root.children)
 
     def whole(self) -> bytes:
-        """The text with all changes."""
+        """Return the text with all changes."""
         return self._written(0, len(self.text), [self.root])
 
     def _written(self, begin: int, end: int, tags: list[Tag]) -> bytes:
@@ -153,7 +151,7 @@ class Markup:
         return tag.inside if self._closed(tag) else self._end_of(tag.end)
 
     def _tag(self, tag: Tag) -> bytes:
-        """An element with its changes."""
+        """Return the text of an element with its changes."""
         indent = self._indent(tag.begin)
         comments = [self._comment(text) + self._newline + indent for text in tag.before]
         if tag.text is not None:
@@ -169,7 +167,7 @@ class Markup:
         return b"".join([*comments, *whole, *behind])
 
     def _first(self, tag: Tag, indent: bytes) -> bytes:
-        """Elements that are new, before all others."""
+        """Return the text of the elements inserted before all children."""
         below = self._indent(tag.children[0].begin) if tag.children else indent + b"  "
         parts = []
         for comments, element in tag.within:
@@ -178,7 +176,7 @@ class Markup:
         return b"".join(parts)
 
     def _start(self, tag: Tag) -> bytes:
-        """The start tag with its changes; what stays keeps its spaces and quotes."""
+        """Return the changed start tag; unchanged attributes keep their spaces and quotes."""
         text = self.text[tag.begin : tag.inside]
         at = 1 + len(tag.name.encode())
         parts = [b"<", (tag.renamed or tag.name).encode()]
@@ -197,12 +195,12 @@ class Markup:
         return b"".join([*parts, text[at:]])
 
     def _comment(self, text: str) -> bytes:
-        # Two hyphens end a comment too early, and so would one at its end.
+        # Two hyphens would end a comment early, and so would a hyphen at its end.
         safe = re.sub(r"-(?=-)", "- ", text)
         return f"<!-- {safe} -->".encode().replace(b"\n", self._newline)
 
     def _indent(self, begin: int) -> bytes:
-        """The spaces before an element on its line; none where something else stands there."""
+        """Return the indentation of an element; empty if other text precedes it on its line."""
         line = self.text[self.text.rfind(b"\n", 0, begin) + 1 : begin]
         return line if not line.strip() else b""
 
@@ -212,26 +210,28 @@ def _attribute(name: str, value: str) -> bytes:
 
 
 def heading(lines: list[str]) -> str:
-    """What stands at the top of a file that was written: what it is, and a line for each of what is
-    to be known of it.
+    """Format the comment at the top of a written file.
+
+    Args:
+        lines: description of the file, followed by notes.
     """
     first, *more = lines
     return "\n     ".join([f"{first}; written by simgap", *more])
 
 
 def without_heading(text: str) -> str:
-    """A text without what stands at its top."""
+    """Remove the comment at the top of a written file."""
     return re.sub(
         r"<!-- (?:(?!-->).)*?; written by simgap.*?-->", "", text, count=1, flags=re.DOTALL
     )
 
 
 def number(value: float) -> str:
-    """The shortest text that reads as the same number."""
+    """Format a number with the fewest digits that are read back as the same number."""
     text = repr(float(value))
     return text[:-2] if text.endswith(".0") else text
 
 
 def numbers(values: tuple[float, ...]) -> str:
-    """Numbers as MJCF and URDF write them."""
+    """Format numbers as a list of MJCF or URDF."""
     return " ".join(number(value) for value in values)

@@ -1,6 +1,4 @@
-"""Physical limits of a body's centre of mass: how far its link reaches, and along which axes of its
-frame the position of the centre of mass can be observed at all.
-"""
+"""Physical limits and observability of the position of a body's centre of mass."""
 
 from __future__ import annotations
 
@@ -14,23 +12,31 @@ from sims.base import Array
 from sims.robot.model import Robot
 
 THINNEST = 0.25
-"""Half width of a link's box is at least this share of its longest side: motors and cables stick
-out of a thin rod.
+"""Minimum half width of a link's box, as a share of its longest side.
+
+Motors and cables protrude from a thin rod.
 """
 MARGIN = 0.1
-"""The box is enlarged by this share of its longest side on each face."""
+"""Margin of a link's box on each face, as a share of its longest side."""
 PARALLEL = 1.0 - 1e-9
-"""Absolute cosine above which two joint axes are parallel."""
+"""Absolute cosine above which two joint axes count as parallel."""
 UNKNOWN_LENGTH = 0.1
-"""Longest side in metres of a link in a robot whose file states no lengths."""
+"""Assumed longest side, in metres, of a link in a robot whose file specifies no lengths."""
 
 
 def reach(robot: Robot, body: str) -> Array:
-    """Return the box that a body's centre of mass cannot leave, (3, 2) lowest and highest offset
-    from the stated centre of mass in metres, along the axes of the body's frame.
+    """Return the limits of the offset of a body's centre of mass.
 
-    The box holds the geoms of the link and the joints of the links that it carries. A link without
-    either is taken to be as long as its distance from the joint before.
+    The limits are a box that contains the geoms of the link and the joints of its child links. A
+    link without either is assumed to be as long as its distance from its parent.
+
+    Args:
+        robot: robot with the body.
+        body: name of the body.
+
+    Returns:
+        (3, 2) lowest and highest offset from the specified centre of mass, in metres, along the
+        axes of the body's frame.
     """
     model, data = _at_start(robot)
     number = robot.body(body).id
@@ -44,8 +50,10 @@ def reach(robot: Robot, body: str) -> Array:
 
 
 def _points(model: Any, data: Any, number: int) -> Iterator[Array]:
-    """Points of a link in its own frame: its origin, its stated centre of mass, corners of its
-    geoms, and origins of the bodies that it carries.
+    """Yield the points of a link, in its own frame, that its box must contain.
+
+    They are its origin, its specified centre of mass, the corners of its geoms, and the origins of
+    its child bodies.
     """
     import mujoco
 
@@ -70,7 +78,7 @@ def _points(model: Any, data: Any, number: int) -> Iterator[Array]:
 
 
 def _fixed_to(model: Any, number: int) -> list[int]:
-    """A body and those that are fixed to it."""
+    """Return a body and the bodies that are rigidly attached to it."""
     found = [number]
     for child in range(number + 1, model.nbody):
         if model.body_parentid[child] in found and not model.body_jntnum[child]:
@@ -79,22 +87,29 @@ def _fixed_to(model: Any, number: int) -> list[int]:
 
 
 def _length(model: Any, number: int) -> float:
-    """Length in metres of a link of which the file states no shape: its distance from the link
-    before, else the longest such distance in the robot.
+    """Return the assumed length, in metres, of a link without a specified shape.
+
+    It is the distance of the link from its parent, or else the longest such distance in the robot.
     """
     distances = np.linalg.norm(model.body_pos[1:], axis=1)
     return float(distances[number - 1]) or float(distances.max(initial=0.0)) or UNKNOWN_LENGTH
 
 
 def observable_axes(robot: Robot, body: str) -> tuple[int, ...]:
-    """Return the axes (0, 1, 2 for x, y, z) of a body's frame along which a shift of its centre of
-    mass can change the motion.
+    """Return the frame axes along which a shift of a body's centre of mass changes the motion.
 
-    Let all hinges between the world and the body have parallel axes. A shift along that direction
-    moves no mass relative to the axes and changes no torque of gravity, so the axis of the frame
-    that is nearest to it is left out: offsets along the two others give every possible motion. A
-    body that only slides has no observable axis; one that floats or turns about several directions
-    has three.
+    If all hinges between the world and the body have parallel axes, a shift along that direction
+    moves no mass relative to the hinges and changes no torque of gravity. So the frame axis nearest
+    to that direction is omitted; offsets along the two others give every possible motion. A body
+    that only slides has no observable axis. A floating body, or one that turns about several
+    directions, has three.
+
+    Args:
+        robot: robot with the body.
+        body: name of the body.
+
+    Returns:
+        Observable axes, 0, 1, 2 for x, y, z.
     """
     return _observable(robot.compiled, robot.body(body).id)
 
@@ -120,7 +135,7 @@ def _observable(model: Any, number: int) -> tuple[int, ...]:
     if any(abs(float(axis @ axes[0])) < PARALLEL for axis in axes):
         return (0, 1, 2)
     along = data.xmat[number].reshape(3, 3).T @ axes[0]
-    # Of a diagonal direction the file's axis nearest to it: the two others reach all that matters.
+    # For a diagonal direction the nearest frame axis is omitted, since the two others suffice.
     nearest = int(np.argmax(np.abs(along).round(9)))
     return tuple(axis for axis in range(3) if axis != nearest)
 
@@ -131,7 +146,7 @@ def _at_start(robot: Robot) -> tuple[Any, Any]:
 
 @lru_cache(maxsize=8)
 def _started(model: Any) -> Any:
-    """Kinematics of a model at its initial position."""
+    """Compute the kinematics of a model in its reference pose."""
     import mujoco
 
     data = mujoco.MjData(model)

@@ -1,8 +1,8 @@
 """Linearisation of a robot's model about a measured motion, from sample to sample.
 
 `sims.robot.linear` linearises about a simulated motion, which may be far from the data. Here the
-motion is a given one, such as a smoothed measurement, with x̄[t] the state at step t. The model's
-step F misses it by the defect
+motion is given, such as a smoothed measurement, with the state x̄[t] at step t. The model's step F
+differs from it by the defect
 
     d[t] = x̄[t+1] - F(x̄[t], u[t])                                                            (1)
 
@@ -10,13 +10,13 @@ so that a deviation δ = x - x̄ of the true state follows, to first order,
 
     δ[t+1] = A[t] δ[t] - d[t] + B[t] (f[t] + Σ_k c_k φ_k[t])                                   (2)
 
-with f a generalised force that the model lacks, and φ_k the force of a candidate effect k with
+with a generalised force f that the model lacks, and the force φ_k of a candidate effect k with
 coefficient c_k. Composed over the steps between two samples i and i + 1,
 
     δ[i+1] = A_i δ[i] - d_i + G_i f_i + Σ_k c_k b_ik                                           (3)
     y[i] = h(x̄[i]) + H_i δ[i] + Σ_k c_k ψ_ik                                                   (4)
 
-where f_i is held between samples and ψ is what an effect changes about a reading directly.
+where f_i is constant between samples, and ψ is the direct change of a reading by an effect.
 """
 
 from __future__ import annotations
@@ -44,20 +44,21 @@ from sims.system import Acting, Input, Sensor, members_of
 SingleArray = NDArray[np.float32]
 
 FARTHEST = 1e3
-"""Largest deviation of a smoothed state from the measured motion, SI units."""
+"""Maximum deviation of a smoothed state from the measured motion, in SI units."""
 BLOCK = 64
 """Number of candidates whose responses are computed together."""
 LONGEST_HELD = 0.02
-"""Maximum number of seconds over which a Jacobian holds."""
+"""Maximum time, in seconds, for which a Jacobian is reused."""
 SMALL = 1e-4
-"""Size of the state difference from which the derivatives of readings are taken."""
+"""Size of the state difference for finite-difference derivatives of readings."""
 
 
 class Trajectory(NamedTuple):
     """States of one run at the beginnings of all steps and at the end.
 
     Attributes:
-        x, v: (S + 1, D) positions and velocities of the joints.
+        x: (S + 1, D) positions of the joints.
+        v: (S + 1, D) velocities of the joints.
         afloat: (S + 1, P) poses and (S + 1, F) velocities of floating joints.
     """
 
@@ -68,17 +69,19 @@ class Trajectory(NamedTuple):
 
 @dataclass(frozen=True)
 class IntervalMaps:
-    """The linear model (3) and (4) of one run with T samples, Z states, E forces, C channels.
+    """The linear model (3) and (4) of one run with T samples.
+
+    There are Z state components, E forces, and C channels.
 
     Attributes:
         states: A (T - 1, Z, Z).
         defects: d (T - 1, Z).
         forces: G (T - 1, Z, E).
-        inputs: (T - 1, Z, E + nu) the same of forces and controls.
+        inputs: (T - 1, Z, E + nu) responses to constant forces and controls.
         readings: H (T, C, Z).
         predicted: h(x̄) (T, C).
-        step_errors: (T - 1, Z) what the steps of the integrator miss.
-        jumps: (T - 1, Z) standard deviations of what force limits of servos do to the state.
+        step_errors: (T - 1, Z) discretisation errors of the integrator.
+        jumps: (T - 1, Z) standard deviations of state jumps at force limits of servos.
     """
 
     states: Array
@@ -95,15 +98,15 @@ class MeasuredLinear(Linear):
     """The linear model of one run about a given motion.
 
     Args:
-        simulator: the robot's simulator.
-        theta: (dim,) its parameters.
-        scenario: the run.
+        simulator: simulator of the robot.
+        theta: (dim,) parameters.
+        scenario: scenario of the run.
         start: (D,) positions and velocities at which the simulated motion begins.
-        trajectory: the motion.
-        measured: in its place, (T, 3) position, velocity and acceleration at the samples of joints,
-            by their numbers; all others move as they are simulated.
-        nearby: the linear model of a motion nearby, whose commands and readings are used again.
-        is_alike: whether its Jacobians are used again as well.
+        trajectory: given motion.
+        measured: alternative to `trajectory`: (T, 3) position, velocity and acceleration at the
+            samples, by joint number; all other joints follow the simulation.
+        nearby: linear model of a similar motion, whose commands and readings are reused.
+        is_alike: whether its Jacobians are reused as well.
     """
 
     def __init__(
@@ -124,7 +127,7 @@ class MeasuredLinear(Linear):
         self.held = float(np.clip(spacing, HELD, LONGEST_HELD))
         super().__init__(simulator, theta, scenario, *start)
         if self._names:
-            # Readings of the given motion, not of the simulated one.
+            # The readings belong to the given motion, not to the simulated one.
             with np.errstate(all="ignore"), quiet():
                 read = self._tangent.motion_readings
             self._readings = {name: read[:, i] for i, name in enumerate(self._names)}
@@ -137,12 +140,12 @@ class MeasuredLinear(Linear):
 
     @property
     def step(self) -> float:
-        """Seconds of a step of the simulator."""
+        """Time step of the simulator in seconds."""
         return self._motion.step
 
     @property
     def positions(self) -> int:
-        """Number of positions in a state, those of joints in series included."""
+        """Number of positions in a state, including joints in series."""
         return int(self._motion.x.shape[1])
 
     @property
@@ -153,15 +156,16 @@ class MeasuredLinear(Linear):
     def _nominal(self) -> Motion:
         motion = self._near() or super()._nominal()
         given = self._given or self._from_samples(motion)
-        # Joints in series are not measured: they keep the simulated motion.
+        # Joints in series are not measured, so they keep the simulated motion.
         own = given.x.shape[1]
         x, v = motion.x.copy(), motion.v.copy()
         x[:, :own], v[:, :own] = given.x, given.v
         return self._with_loads(replace(motion, x=x, v=v, afloat=given.afloat))
 
     def _near(self) -> Motion | None:
-        """Return the motion nearby with the commands of this model, which saves a simulation; None
-        where there is none, or where more moves than the joints that are given.
+        """Return the motion of `nearby` with the commands of this model, which saves a simulation.
+
+        The result is None if there is no such motion, or if more than the given joints moves.
         """
         if self._nearby is None or self._given is None:
             return None
@@ -175,7 +179,7 @@ class MeasuredLinear(Linear):
 
     def _from_samples(self, motion: Motion) -> Trajectory:
         """Interpolate the measured joints between samples by quintic Hermite polynomials."""
-        # Joints that are not recorded may explode in the simulation.
+        # Joints that are not recorded may diverge in the simulation.
         x, v = (np.clip(np.nan_to_num(u), -FARTHEST, FARTHEST) for u in (motion.x, motion.v))
         steps: Array = self._simulator.step * np.arange(float(len(x)))
         for joint, samples in self._measured.items():
@@ -184,7 +188,7 @@ class MeasuredLinear(Linear):
         return Trajectory(x[:, :own], v[:, :own], motion.afloat)
 
     def _with_loads(self, motion: Motion) -> Motion:
-        """Return the motion with the loads that transmissions carry in it."""
+        """Return the motion with the loads of the transmissions, if any effect depends on them."""
         effects = [m for effect in self._simulator.effects for m in members_of(effect)]
         if not any((e.of or e.name) in LOADED for e in effects):
             return motion
@@ -233,7 +237,7 @@ class MeasuredLinear(Linear):
         )
 
     def _jumps(self) -> Array:
-        """(T - 1, Z) standard deviations of the jumps at force limits of stiff servos."""
+        """Return the standard deviations (T - 1, Z) of jumps at force limits of stiff servos."""
         bench = self._simulator.wide(self._work.acting)
         limits = bench.force_limits
         result = np.zeros((self.knots.size - 1, self._tangent.size))
@@ -244,14 +248,14 @@ class MeasuredLinear(Linear):
         own = limits.jumps[:, bench.places.velocities]
         for steps, active in self._within():
             result[active, : own.shape[1]] += reached[steps] @ own
-        # A position servo comes back from a jump of position within the interval or later.
+        # A position servo returns from a jump of position within the interval or later.
         lengths = np.maximum(np.diff(self.knots), 1)[:, None] * self._simulator.step
         moved = self.positions
         result[:, moved : 2 * moved] = result[:, :moved] / lengths
         return result
 
     def _step_errors(self) -> Array:
-        """(N, Z) what a step misses; nothing for Runge-Kutta, which is of fourth order."""
+        """Return the discretisation errors (N, Z); zero for the fourth-order Runge-Kutta."""
         simulator, tangent = self._simulator, self._tangent
         if ends(simulator.wide(self._work.acting).model):
             return np.zeros((tangent.looks_at, tangent.size))
@@ -259,8 +263,10 @@ class MeasuredLinear(Linear):
             return tangent.step_errors(simulator.half_steps(self._work.acting))
 
     def _within(self) -> list[tuple[Places, Places]]:
-        """The first step of every interval, then the second, …: step numbers, and which intervals
-        have one.
+        """Return the active intervals of the first step, then of the second, and so on.
+
+        Each entry contains the step numbers, and the numbers of the intervals that have such a
+        step.
         """
         lengths = np.diff(self.knots)
         result = []
@@ -272,17 +278,17 @@ class MeasuredLinear(Linear):
     def added(self, effects: Sequence[Added], predicted: Array) -> tuple[SingleArray, SingleArray]:
         """Compute what candidate effects add to (3) and (4).
 
-        A force is taken for its mean over the interval between two samples. Effects of sensors are
-        those on predicted readings: a gain of the reading itself would contain the noise that it
-        is to explain.
+        A force is replaced by its mean over the interval between two samples. Sensor effects are
+        applied to predicted readings: a gain applied to the recorded reading would contain the
+        noise that it has to explain.
 
         Args:
             effects: K effects with their coefficients; those in series with a joint add nothing.
-            predicted: δ (T, Z) at the samples, predicted from the samples before each.
+            predicted: δ (T, Z) at the samples, each predicted from the preceding samples.
 
         Returns:
-            Mean forces and controls (T - 1, E + nu, K), of which `IntervalMaps.inputs` make b; and
-            ψ (T, C, K); both in single precision.
+            Mean forces and controls (T - 1, E + nu, K), which `IntervalMaps.inputs` convert to b;
+            and ψ (T, C, K); both in single precision.
         """
         count, samples = len(effects), self.knots.size
         quotients = self._tangent.quotients
@@ -311,7 +317,7 @@ class MeasuredLinear(Linear):
         return means, readings
 
     def _means(self, pushed: Array) -> Array:
-        """Return means (T - 1, E + nu, K) over the intervals of what is pushed (S, E + nu, K)."""
+        """Return interval means (T - 1, E + nu, K) of forces and controls (S, E + nu, K)."""
         lengths = np.diff(self.knots)
         some = np.flatnonzero(lengths)
         result = np.zeros((lengths.size, *pushed.shape[1:]))
@@ -321,7 +327,7 @@ class MeasuredLinear(Linear):
 
     @cached_property
     def _composed(self) -> Array:
-        """(T - 1, Z, E + nu) what a force or control held over each interval adds to the state."""
+        """State changes (T - 1, Z, E + nu) per constant force or control over an interval."""
         tangent = self._tangent
         of, quotients = tangent.looked_at, tangent.quotients
         by = np.concatenate([quotients.forces, quotients.controls], axis=2)
@@ -332,15 +338,19 @@ class MeasuredLinear(Linear):
         return result
 
     def _read_directly(self, read: Array, sensors: Sequence[Acting], predicted: Array) -> Array:
-        """Return ψ (T, C, K) from changes of readings (S, O, K), and from sensors' effects on
-        readings of the predicted deviations (T, Z).
+        """Compute the direct changes ψ (T, C, K) of readings.
+
+        Args:
+            read: (S, O, K) direct changes of readings by effects in the model.
+            sensors: sensor effects of each of the K candidates.
+            predicted: (T, Z) predicted deviations, to whose readings sensor effects are applied.
         """
         result = np.zeros((self.knots.size, self.observed.shape[1], len(sensors)))
         some = [k for k, acting in enumerate(sensors) if acting or read[:, :, k].any()]
         if not some:
             return result
         sensed = np.array([bool(sensors[k]) for k in some])
-        # The last one has no effect: it is what the sensors' effects are compared with.
+        # The last row has no sensor effects; it is the reference for the others.
         states = np.zeros((len(some) + 1, self._motion.x.shape[0], self._tangent.size))
         if sensed.any():
             forces = self._tangent.quotients.forces.shape[2]
@@ -359,7 +369,7 @@ class MeasuredLinear(Linear):
 
         Args:
             begun: δ (T, Z) at the samples.
-            forces: f (T - 1, E) held between samples.
+            forces: f (T - 1, E), constant between samples.
         """
         tangent = self._tangent
         of, quotients = tangent.looked_at, tangent.quotients
@@ -377,8 +387,8 @@ class MeasuredLinear(Linear):
         return result
 
     def moved(self, deviations: Array) -> Trajectory:
-        """Return the motion moved by deviations (S + 1, Z) of states."""
-        # Where the linear model explodes the motion stays as it is.
+        """Return the motion with deviations (S + 1, Z) of states added."""
+        # The motion is not changed where the linear model diverges.
         deviations = np.where(np.abs(deviations) < FARTHEST, deviations, 0.0)
         own, motion = len(self._simulator.addresses.positions), self._motion
         size, na = motion.x.shape[1], motion.act.shape[1]
@@ -397,12 +407,12 @@ class MeasuredLinear(Linear):
 
 
 def quintic(times: Array, samples: Array, instants: Array) -> tuple[Array, Array]:
-    """Interpolate by quintic Hermite polynomials, and linearly beyond the last sample.
+    """Interpolate by quintic Hermite polynomials, and extrapolate linearly.
 
     Args:
-        times: (T,) of the samples, ascending.
+        times: (T,) sample times, ascending.
         samples: (T, 3) values, first and second derivatives.
-        instants: (n,) at which to interpolate.
+        instants: (n,) times at which to interpolate.
 
     Returns:
         Values and first derivatives (n,).
@@ -413,7 +423,7 @@ def quintic(times: Array, samples: Array, instants: Array) -> tuple[Array, Array
     s = (within - times[below]) / h
     (x0, v0, a0), (x1, v1, a1) = samples[below].T, samples[below + 1].T
     v0, a0, v1, a1 = h * v0, h * h * a0, h * v1, h * h * a1
-    # Coefficients of the polynomial in s that has these values at 0 and at 1.
+    # Coefficients of the polynomial in s with these values at 0 and at 1.
     c2 = 0.5 * a0
     c3 = 10.0 * (x1 - x0) - 6.0 * v0 - 4.0 * v1 - 1.5 * a0 + 0.5 * a1
     c4 = -15.0 * (x1 - x0) + 8.0 * v0 + 7.0 * v1 + 1.5 * a0 - a1

@@ -1,4 +1,4 @@
-"""What MuJoCo's compiler refuses and can be mended: moments of inertia, massless bodies, meshes."""
+"""Automatic repairs that make a model compile: moments of inertia, massless bodies, meshes."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from sims.robot.words import listed, told
 from sims.robot.xmlfile import Files
 
 MASS = 1e-6
-"""kg of a body that states none and moves."""
+"""Mass, in kg, given to a moving body without a mass."""
 ABOUT_A_MESH = re.compile(r"mesh|vert|face|stl|obj|msh|hull|volume", re.IGNORECASE)
 ABOUT_A_PICTURE = re.compile(r"png|ktx|texture|image", re.IGNORECASE)
 
 
 @dataclass
 class Mends:
-    """What was mended while a spec was compiled.
+    """Repairs made while a spec was compiled.
 
     Attributes:
-        files: what has been read.
-        left: the shapes that were left out.
-        balanced: bodies with their principal moments before and after.
-        massless: bodies that were given a mass, by whether something hangs on them.
+        files: reader of the model file and its assets.
+        left: omitted shapes.
+        balanced: bodies whose principal moments were changed, with the values before and after.
+        massless: bodies that were given a mass, by whether other bodies are attached to them.
         slight: bodies that were given moments of inertia.
     """
 
@@ -40,17 +40,17 @@ class Mends:
     slight: list[str] = field(default_factory=list)
 
     def compiled(self, spec: Any) -> tuple[Any, Any]:
-        """Compile a spec, and mend what MuJoCo refuses and can be mended.
+        """Compile a spec, and repair what MuJoCo rejects.
 
         Args:
-            spec: a mujoco.MjSpec, not to be used afterwards.
+            spec: a mujoco.MjSpec; it must not be used afterwards.
 
         Returns:
-            The spec with what was mended, before it is compiled: afterwards it would hold all
-            meshes once more. And the compiled model.
+            The repaired spec, copied before compilation since a compiled spec holds all meshes
+            twice; and the compiled model.
 
         Raises:
-            InputError: MuJoCo refuses the model, in its own words.
+            InputError: MuJoCo rejects the model; contains MuJoCo's message.
         """
         for _ in range(2 * (len(spec.bodies) + len(spec.meshes) + len(spec.textures)) + 2):
             try:
@@ -103,7 +103,7 @@ class Mends:
 
     @property
     def notes(self) -> list[str]:
-        """One line for each kind of mend."""
+        """Notes, one for each kind of repair."""
         notes = self.left.notes
         if self.balanced:
             notes.append(
@@ -121,7 +121,10 @@ class Mends:
 
 
 def _moments(body: Any) -> tuple[Array, Array | None]:
-    """Principal moments as stated, kg m^2, and their axes; None where they are the body's own."""
+    """Return the specified principal moments in kg m^2, and their axes or None.
+
+    None stands for the axes of the body's inertial frame.
+    """
     full = np.asarray(body.fullinertia, dtype=float)
     if np.isfinite(full).all() and full.any():
         return inertia.principal(list(full))

@@ -1,4 +1,4 @@
-"""Where meshes lie that a URDF names, and which of them are absent."""
+"""Find the mesh files that a URDF refers to, and record the missing ones."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from sims.robot.words import listed
 from sims.robot.xmlfile import MESH, Files
 
 ENDINGS = (".stl", ".obj", ".msh")
-"""Of meshes that MuJoCo reads."""
+"""File name suffixes of mesh formats that MuJoCo reads."""
 UPWARDS = 6
-"""Folders above the file in which a package is looked for."""
+"""Maximum number of parent folders of the model file in which a package is searched."""
 
 
 @dataclass
 class Meshes:
-    """The meshes that a URDF names.
+    """Mesh files that a URDF refers to.
 
     Attributes:
-        files: what has been read.
-        folder: where MuJoCo is told to look for meshes, relative to the model file or absolute.
-        left: by the reason why, those that were left out.
-        found: by name, the path relative to the model file's folder.
+        files: reader of the model file and its assets.
+        folder: mesh folder given to MuJoCo, relative to the model file or absolute.
+        left: names of omitted meshes, by reason.
+        found: paths of the meshes found, relative to the model file's folder, by name in the URDF.
     """
 
     files: Files
@@ -32,7 +32,15 @@ class Meshes:
     found: dict[str, str] = field(default_factory=dict)
 
     def find(self, name: str) -> tuple[str | None, str]:
-        """A mesh's path, relative to the model file's folder, else None and why not."""
+        """Find the file of a mesh.
+
+        Args:
+            name: file name or URI in the URDF.
+
+        Returns:
+            The path relative to the model file's folder and an empty text, or None and the reason
+            why the mesh cannot be used.
+        """
         ending = PurePosixPath(name).suffix
         if ending.lower() not in ENDINGS:
             return None, f"is of a format that MuJoCo does not read ({ending or 'none'})"
@@ -46,7 +54,7 @@ class Meshes:
         return self.found[name], ""
 
     def _candidates(self, name: str) -> list[Path]:
-        """Where it may lie, in the order in which it is looked for."""
+        """Return the possible paths of a mesh, in the order in which they are tried."""
         here = self.files.path.parent
         scheme, separator, rest = name.partition("://")
         if not separator:
@@ -61,19 +69,24 @@ class Meshes:
         candidates = []
         above = here.resolve()
         for folder in [above, *above.parents][: UPWARDS + 1]:
-            # The folder is the package, holds it, or stands for it under another name.
+            # The folder is the package, contains it, or is the package under another name.
             inside = folder.joinpath(*within)
             candidates += [inside] if folder.name == package else []
             candidates += [folder / rest, inside]
         return candidates
 
     def leave_out(self, name: str, why: str) -> None:
-        """Note that a link does without it."""
+        """Record that a link omits a mesh.
+
+        Args:
+            name: file name or URI in the URDF.
+            why: reason.
+        """
         self.left.setdefault(why, []).append(PurePosixPath(name).name)
 
     @property
     def notes(self) -> list[str]:
-        """One line for each reason why shapes were left out."""
+        """One note for each reason why shapes were omitted."""
         return [
             f"shapes left out, and their contacts, since their mesh {why}: {listed(names)}"
             for why, names in self.left.items()
@@ -81,7 +94,7 @@ class Meshes:
 
 
 def exists(path: Path) -> bool:
-    """Whether there is such a file; a name that none can have is no file's."""
+    """Return whether the path is an existing file; False for names that the system rejects."""
     try:
         return path.is_file()
     except (OSError, ValueError):

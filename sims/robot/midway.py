@@ -1,15 +1,16 @@
-"""Where lanes are in the middle of a step, foretold at its beginning.
+"""Predicted state at the middle of a step, from the state at its beginning.
 
-MuJoCo holds what is applied over a step. A force that is asked for at its beginning is half a step
-late, an error of first order; asked for in its middle it gives the momentum that the force over the
-step does, to second order (the midpoint rule: E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary
-Differential Equations I, section II.1). With h the step, a the acceleration as MuJoCo last had it,
-and d what a transmission carries, at the beginning of step k and at the end of step k - 1,
+MuJoCo holds applied forces constant over a step. A force evaluated at the beginning is half a step
+late, an error of first order. Evaluated at the middle, it gives the momentum of the force over the
+step, to second order (the midpoint rule: E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary
+Differential Equations I, section II.1). With the step h, the last acceleration a that MuJoCo
+computed, and the load d of a transmission at the beginning of step k and at the end of step k - 1,
 
     v(h / 2) = v + h/2 a,    x(h / 2) = x + h/2 v + h²/8 a                                       (1)
     d(h / 2) = d_k + (d_{k-1, end} - d_{k-1}) / 2                                                (2)
 
-In (2) both are of the same command: what jumps with a command jumps in d_k alone.
+In (2) both terms of the difference have the same command: a jump with a command only appears in
+d_k.
 """
 
 from __future__ import annotations
@@ -27,15 +28,16 @@ Mask = NDArray[np.bool_]
 
 
 class Look(NamedTuple):
-    """The joints of lanes at the beginning of a step, (L, D) each.
+    """States of joints in a batch at the beginning of a step, (L, D) each.
 
     Attributes:
         x: positions.
         v: velocities.
-        a: accelerations, as MuJoCo last had them.
-        drive: what actuators exert on them.
-        bias: what comes of gravity and the motion of the other bodies.
-        later_drive, later_bias: the same in the middle of the step.
+        a: last accelerations that MuJoCo computed.
+        drive: forces of the actuators on the joints.
+        bias: forces by gravity and the motion of the other bodies.
+        later_drive: forces of the actuators at the middle of the step.
+        later_bias: forces by gravity and motion at the middle of the step.
     """
 
     x: Array
@@ -48,37 +50,45 @@ class Look(NamedTuple):
 
     @property
     def carried(self) -> tuple[Array, Array]:
-        """What transmissions carry, from either side."""
+        """Forces on both sides of the transmissions."""
         return self.drive, self.bias
 
     @property
     def later(self) -> tuple[Array, Array]:
-        """The same in the middle of the step."""
+        """Forces on both sides of the transmissions at the middle of the step."""
         return self.later_drive, self.later_bias
 
 
 def middle(x: Array, v: Array, a: Array, step: Array | float) -> tuple[Array, Array]:
-    """Positions and velocities half a step later, (1)."""
+    """Predict positions and velocities half a step later, by (1).
+
+    Args:
+        x: positions.
+        v: velocities.
+        a: accelerations.
+        step: step length in seconds.
+    """
     half = 0.5 * step
     later = v + half * a
-    # That it turns round within half a step is not for a straight line to say.
+    # A reversal within half a step cannot be predicted by a linear extrapolation.
     later = np.where(later * v < 0.0, v, later)
     return x + half * (v + (0.5 * half) * a), later
 
 
 class Midway:
-    """Looks at the first lanes of a batch at the beginning of every step in turn.
+    """Predictor of joint states at the middle of each step, for the first elements of a batch.
 
-    Made before MuJoCo looks at the lanes for the first time: fields show nothing that they were
-    not bound for.
+    It must be created before MuJoCo's first evaluation of the batch, since fields that are bound
+    later are not updated.
 
     Attributes:
-        of: where the joints stand among velocities.
+        of: addresses of the joints' velocities.
 
     Args:
         batch: the mujoco.batch.Batch.
-        positions, velocities: of the joints in MuJoCo's vectors.
-        loaded: (L,) lanes in which it matters what transmissions carry; so many are looked at.
+        positions: addresses of the joints' positions.
+        velocities: addresses of the joints' velocities.
+        loaded: (L,) whether the load of transmissions matters; L is the number of elements in use.
     """
 
     def __init__(self, batch: Any, positions: Places, velocities: Places, loaded: Mask) -> None:
@@ -91,17 +101,17 @@ class Midway:
         for name in ("qvel", "qacc", "qfrc_actuator", "qfrc_bias"):
             self._fields.append((batch.bind(name)[: len(loaded)], self.of))
         self._last = np.zeros((2, len(loaded), len(velocities)))
-        # Of (2), where it matters.
+        # Factor of the load change in (2), zero where loads do not matter.
         self._share = 0.5 * loaded[:, None]
 
     def look(self, anew: Mask) -> Look:
-        """The lanes at the beginning of a step.
+        """Return the joint states at the beginning of a step.
 
         Args:
-            anew: (L,) in which commands have changed since the step before; they are written.
+            anew: (L,) whether commands have changed since the previous step; they are already set.
         """
         x, v, a, drive, bias = self._shown()
-        # Without what is applied, which nothing was yet, the acceleration leads nowhere.
+        # The initial acceleration lacks the applied forces, so it is not used for prediction.
         first, self._first = self._first, False
         a = np.zeros_like(a) if first else a
         if not self._any:
@@ -110,17 +120,17 @@ class Midway:
         return Look(x, v, a, *begun, *later)
 
     def _shown(self) -> list[Array]:
-        """Fields as MuJoCo last had them, (L, D) each."""
+        """Return the present values of the fields, (L, D) each."""
         return [field[:, places] for field, places in self._fields]
 
     def _sides(self, anew: Mask, first: bool) -> tuple[Array, Array]:
-        """(2, L, D) what transmissions carry at the beginning of a step and in its middle."""
+        """Return the transmission loads (2, L, D) at the beginning and at the middle of a step."""
         ended = self._carried()
         begun, last = ended, self._last
         asked = self._loaded & anew if self._ends else self._loaded
-        # At the very beginning MuJoCo has just looked.
+        # At the first step MuJoCo has already evaluated the batch.
         if not first and asked.any():
-            # Of no other lane, whose numbers shall not hang on its company.
+            # Only these batch elements are evaluated, so that no element depends on others.
             self._batch.forward(np.flatnonzero(asked))
             begun = self._carried()
         self._last = begun
@@ -129,7 +139,7 @@ class Midway:
         return begun, begun + self._share * (ended - last)  # (2)
 
     def _carried(self) -> Array:
-        """A copy of the last two fields, (2, L, D)."""
+        """Return a copy of the drive and bias forces, (2, L, D)."""
         (drive, of), (bias, _) = self._fields[3:]
         lanes, joints = len(self._loaded), self._last.shape[-1]
         result = np.empty((2, lanes, joints))
@@ -139,22 +149,24 @@ class Midway:
 
 
 def ends(model: Any) -> bool:
-    """Whether forces that MuJoCo leaves of a step are those of its end: Runge-Kutta looks there
-    last, the other integrators at its beginning.
+    """Return whether the forces left in MuJoCo's data after a step are those of its end.
+
+    The last evaluation of Runge-Kutta is at the end of the step, that of the other integrators at
+    its beginning.
     """
     return bool(model.opt.integrator == RK4)
 
 
 def midways(ended: Array, controls: Array) -> Array:
-    """What transmissions carry in the middle of every step of a motion.
+    """Compute transmission loads (2, S, D) at the middle of every step of a motion.
 
     Args:
-        ended: (2, S, D) at the ends of the steps, each with its own command.
+        ended: (2, S, D) loads at the ends of the steps, each with its own command.
         controls: (S, nu) commands.
     """
     grown = np.diff(ended, axis=1, prepend=ended[:, :1])
     jumps: Mask = np.any(np.diff(controls, axis=0, prepend=np.nan) != 0, axis=1)
-    # What jumps with a command has not grown over the step: as it grows over the next one.
+    # A jump with a command is no growth within the step, so the growth of the next step is used.
     after = np.append(jumps[1:], True)
     grown[:, jumps & after] = 0.0
     then = np.flatnonzero(jumps & ~after)
@@ -164,7 +176,7 @@ def midways(ended: Array, controls: Array) -> Array:
 
 
 def together(places: Places) -> Places | slice:
-    """The same places as a slice where they lie side by side, of which numpy copies nothing."""
+    """Return indices as a slice if they are contiguous, since numpy does not copy slices."""
     first = int(places[0]) if places.size else 0
     alike = np.array_equal(places, np.arange(first, first + places.size))
     return slice(first, first + places.size) if alike else places

@@ -1,6 +1,4 @@
-"""What an MJCF says, made fit to load: what lies in absent files is left out where masses are
-stated.
-"""
+"""Prepare an MJCF for loading: omit elements with missing files where masses are specified."""
 
 from __future__ import annotations
 
@@ -17,25 +15,25 @@ from sims.robot.shapes import Left
 from sims.robot.xmlfile import MESH, Files, children, tree
 
 TETRAHEDRON = "0 0 0 1 0 0 0 1 0 0 0 1"
-"""Vertices that stand for an absent mesh until nothing names it any more."""
+"""Vertices of a placeholder for a missing mesh; the mesh is removed after loading."""
 SIDES = ("file", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback")
 """Attributes of a texture that name files."""
 COUNTS = ("count", "cellcount")
-"""Attributes whose numbers multiply what there is."""
+"""Attributes with counts that multiply the number of elements."""
 MOST = 1e5
-"""Of what is counted."""
+"""Maximum total number of elements that counts may generate."""
 SIZES = {"width": 2e4, "height": 2e4, "nrow": 1e4, "ncol": 1e4, "nkey": 1e5, "nuserdata": 1e6}
-"""Attributes that ask for memory, and the most that they may ask for."""
+"""Attributes that request memory, and their maximum values."""
 
 
 @dataclass
 class Absent:
-    """What a model names and is not there.
+    """Missing files that a model refers to.
 
     Attributes:
-        meshes: by name of the asset, its file.
-        fields: height fields likewise.
-        pictures: files of textures and skins.
+        meshes: missing mesh files by name of the asset.
+        fields: missing height field files by name of the asset.
+        pictures: missing files of textures and skins.
     """
 
     meshes: dict[str, str] = field(default_factory=dict)
@@ -43,10 +41,14 @@ class Absent:
     pictures: list[str] = field(default_factory=list)
 
     def leave_out(self, spec: Any, left: Left) -> None:
-        """Take out of a spec what has an absent file.
+        """Remove elements with missing files from a spec.
+
+        Args:
+            spec: the mujoco.MjSpec; it is changed in place.
+            left: record of omitted shapes.
 
         Raises:
-            InputError: the mass of a body that moves would follow from an absent mesh.
+            InputError: the mass of a moving body depends on a missing mesh.
         """
         why = "is absent"
         for geom in list(spec.geoms):
@@ -61,10 +63,17 @@ class Absent:
 
 
 def found(files: Files, root: Element) -> Absent:
-    """Read the files that an MJCF names, and put stand-ins where they are absent.
+    """Read the files that an MJCF refers to, and insert placeholders for missing ones.
+
+    Args:
+        files: reader of the model file.
+        root: root element of the MJCF; it is changed in place.
+
+    Returns:
+        The missing files.
 
     Raises:
-        InputError: something is too large.
+        InputError: a count, a size or a file is too large, or an attached model is missing.
     """
     _measured(files, root, 1.0)
     absent = Absent()
@@ -90,7 +99,7 @@ def found(files: Files, root: Element) -> Absent:
 
 
 def _measured(files: Files, element: Element, times: float) -> None:
-    """Refuse counts and sizes that would fill the memory."""
+    """Reject counts and sizes that would exhaust the memory."""
     for key, value in element.items():
         numbers = [_size(word) for word in value.split()] if key in (*COUNTS, *SIZES) else []
         most = SIZES.get(key, MOST)
@@ -105,12 +114,12 @@ def _measured(files: Files, element: Element, times: float) -> None:
 def _size(word: str) -> float:
     try:
         return abs(float(word))
-    except ValueError:  # MuJoCo says what it expects
+    except ValueError:  # MuJoCo itself reports what it expects.
         return 0.0
 
 
 def _model(files: Files, element: Element) -> None:
-    """Read a model that is attached, which MuJoCo opens itself."""
+    """Read an attached model, which MuJoCo opens itself."""
     name = element.get("file") or ""
     path = files.path.parent / name.replace("\\", "/")
     if not exists(path):
@@ -118,7 +127,8 @@ def _model(files: Files, element: Element) -> None:
     if path.resolve() in files.included:
         raise files.fault(element, f"{cut(name)} holds itself")
     _measured(files, tree(files, path), 1.0)
-    # It is opened before the spec knows its folder.
+    # MuJoCo opens the attached model before the spec knows its folder, so the path must be
+    # absolute.
     element.set("file", str(path.resolve()))
 
 
@@ -137,7 +147,7 @@ def _read(files: Files, folder: str, name: str, strip: bool) -> bool:
 
 
 def _stand_in(absent: Absent, asset: Element, element: Element, file: str) -> None:
-    """Let an asset load without its file, where it can."""
+    """Replace an asset with a missing file by a placeholder that loads, if possible."""
     name = element.get("name") or PurePosixPath(file.replace("\\", "/")).stem
     if element.tag == "mesh":
         absent.meshes[name] = file
@@ -154,6 +164,6 @@ def _stand_in(absent: Absent, asset: Element, element: Element, file: str) -> No
         asset.remove(element)
         return
     else:
-        return  # MuJoCo says what it lacks
+        return  # MuJoCo itself reports what is missing.
     element.attrib.clear()
     element.attrib.update(kept)

@@ -1,4 +1,4 @@
-"""Statements written into an MJCF: attributes of its elements, each with a comment."""
+"""Write attributes and comments into an MJCF source document."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from sims.robot.stated import (
 )
 
 _ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis", "fullinertia")
-"""What says in another way what ``quat`` and ``diaginertia`` say."""
+"""Attributes that are alternatives to ``quat`` and ``diaginertia``."""
 
 OWN = ("kp", "kv", "ki", "dampratio", "timeconst", "inheritrange")
-"""Attributes of MuJoCo's shortcuts, which ``general`` has not."""
+"""Attributes of MuJoCo's actuator shortcuts that ``general`` does not have."""
 
 _INPUTS = {"position": "pos", "velocity": "vel"}
-"""What the control of a shortcut is, where MuJoCo knows (since 4.0)."""
+"""Values of the attribute ``input`` (MuJoCo 4.0 and later) that replace an actuator shortcut."""
 
 _SERVO = {"gainprm", "biasprm"}
 
@@ -37,13 +37,15 @@ _LISTS = {"damping", "stiffness", "dynprm", "gainprm", "biasprm"}
 
 
 class Writer:
-    """Writes statements into a document.
+    """Writer of attribute statements into a document.
 
     Args:
         document: the MJCF.
-        model: what it compiles to.
-        wanted: what it is to compile to.
-        degrees: whether it states angles in degrees.
+        model: model that the document compiles to.
+        wanted: fields of the model that it should compile to.
+
+    Attributes:
+        degrees: whether the document specifies angles in degrees.
     """
 
     def __init__(self, document: Document, model: Any, wanted: Fields) -> None:
@@ -54,7 +56,7 @@ class Writer:
             self.degrees = compiler.attributes.get("angle", "degree") == "degree"
 
     def write(self, statement: Statement, comments: Sequence[str]) -> None:
-        """State something of an element."""
+        """Write a statement about an element, with comments."""
         element = statement.element
         if element.kind == "option":
             self._option(statement, comments)
@@ -86,7 +88,7 @@ class Writer:
         self.document.root.within.append((list(comments), f"<option {said}/>"))
 
     def _keep_masses(self) -> None:
-        """Let the compiler take inertials as they are stated."""
+        """Change compiler settings so that MuJoCo uses inertials as specified."""
         for compiler in self.document.under("compiler"):
             if compiler.says("inertiafromgeom") == "true":
                 compiler.new["inertiafromgeom"] = "auto"
@@ -130,7 +132,7 @@ class Writer:
         return values
 
     def _actuator(self, tag: Tag, statement: Statement) -> dict[str, str]:
-        """Of an actuator: what its shortcut has words for, or all that ``general`` says."""
+        """Return the attributes of an actuator, as its shortcut if possible, else ``general``."""
         changed = statement.values
         before = {} if statement.insisted else self._before(statement.element)
         own = _shortcut(
@@ -151,7 +153,7 @@ class Writer:
 
 
 def _needed(name: str, values: tuple[float, ...]) -> bool:
-    """Whether a ``general`` must state it in place of a shortcut that implies it."""
+    """Return whether ``general`` must specify an attribute that a shortcut implies."""
     if name in ("dyntype", "gaintype", "biastype", "gainprm", "biasprm"):
         return True
     return name in ("dynprm", "ctrllimited", "ctrlrange") and any(values)
@@ -163,7 +165,17 @@ def _shortcut(
     changed: Mapping[str, Values],
     before: Mapping[str, Values],
 ) -> dict[str, str] | None:
-    """The gains of a shortcut, in its own words; None where it has none for them."""
+    """Return the gains of an actuator shortcut as attributes.
+
+    Args:
+        name: name of the shortcut, such as ``position``.
+        stated: all attribute values that the actuator should have.
+        changed: attribute values to write.
+        before: attribute values of the document; empty if all must be written.
+
+    Returns:
+        The attributes; None if the shortcut cannot express the values.
+    """
     if set(changed) & {"dyntype", "dynprm", "gaintype", "biastype"}:
         return None
     if not set(changed) & _SERVO:
@@ -185,7 +197,7 @@ def _say(tag: Tag, comments: Sequence[str]) -> None:
 
 
 def texts(values: Mapping[str, Values]) -> dict[str, str]:
-    """Values as attributes."""
+    """Format values as text of attributes."""
     return {name: _text(name, stated) for name, stated in values.items()}
 
 
@@ -197,7 +209,7 @@ def _text(name: str, values: tuple[float, ...]) -> str:
     if name in COUNTS:
         return str(int(values[0]))
     if name in _LISTS:
-        # Numbers that a list does not state are zero.
+        # Trailing zeros are omitted, since numbers missing in a list are zero.
         last = max((i for i, value in enumerate(values) if value), default=0)
         return numbers(values[: last + 1])
     return numbers(values)

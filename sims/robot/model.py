@@ -1,6 +1,4 @@
-"""What a robot's model file says, once it is read: its joints, actuators, bodies and sensors, from
-the compiled model.
-"""
+"""A robot read from a model file: joints, actuators, bodies and sensors of the compiled model."""
 
 from __future__ import annotations
 
@@ -21,13 +19,11 @@ Format = Literal["mjcf", "urdf"]
 Kind = Literal["hinge", "slide", "ball", "free"]
 Drive = Literal["motor", "position", "velocity", "pid", "other"]
 KINDS: tuple[Kind, ...] = ("free", "ball", "slide", "hinge")
-"""In the order of MuJoCo's mjtJoint."""
+"""Joint kinds, in the order of MuJoCo's mjtJoint."""
 
 
 TENDON = "_coupling"
-"""What the tendon of a drive that is coupled to two joints is called, behind its own joint's
-name.
-"""
+"""Suffix of the name of a coupled drive's tendon, after the name of the drive's own joint."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +31,13 @@ class Joint:
     """A joint.
 
     Attributes:
-        name: of the model; ``joint3`` where it has none.
-        kind: as MuJoCo calls it.
-        id: its number.
-        position: address of its first position.
-        velocity: address of its first velocity.
-        range: lowest and highest position, rad or m; None where it is not limited.
-        effort: largest force of its actuators, N or N m; None where it is not limited.
+        name: name in the model; such as ``joint3`` if it has none.
+        kind: kind, in MuJoCo's words.
+        id: number in the compiled model.
+        position: address of its first position in qpos.
+        velocity: address of its first velocity in qvel.
+        range: lowest and highest position, rad or m; None if not limited.
+        effort: largest force of its actuators, N or N m; None if not limited.
     """
 
     name: str
@@ -54,17 +50,17 @@ class Joint:
 
     @property
     def single(self) -> bool:
-        """Whether it has one coordinate."""
+        """Whether the joint has one coordinate."""
         return self.kind in ("hinge", "slide")
 
     @property
     def unit(self) -> str:
-        """Of its position."""
+        """Unit of the position."""
         return "rad" if self.kind == "hinge" else "m"
 
     @property
     def force_unit(self) -> str:
-        """Of the force along it."""
+        """Unit of the force along the joint."""
         return "N*m" if self.kind == "hinge" else "N"
 
 
@@ -73,15 +69,16 @@ class Actuator:
     """An actuator.
 
     Attributes:
-        name: of the model; ``actuator3`` where it has none.
-        id: its number.
-        joint: the joint that it drives; None where it drives something else.
-        kind: ``motor`` (its control is a force, by its gear), ``position``, ``velocity``, ``pid``,
-            or ``other``.
-        range: of its (first) control; None where it is not limited.
-        force: lowest and highest force; None where it is not limited.
+        name: name in the model; such as ``actuator3`` if it has none.
+        id: number in the compiled model.
+        joint: joint that it drives; None if it drives something else.
+        kind: ``motor`` (its control is a force, times the gear), ``position``, ``velocity``,
+            ``pid``, or ``other``.
+        range: range of its (first) control; None if not limited.
+        force: lowest and highest force; None if not limited.
         control: address of its first control.
-        controls: how many it has: a pid may have, in this order, a position, a velocity, a force.
+        controls: number of its controls: a pid may have, in this order, a position, a velocity, a
+            force.
     """
 
     name: str
@@ -96,7 +93,7 @@ class Actuator:
 
 @dataclass(frozen=True)
 class Body:
-    """A body that moves, with its number, its mass in kg, and the links that are fused to it."""
+    """A moving body, with its number, its mass in kg, and the links that are fused to it."""
 
     name: str
     id: int
@@ -106,8 +103,12 @@ class Body:
 
 @dataclass(frozen=True)
 class SensorRow:
-    """A row of a sensor: its name (``force.x`` of a sensor with three rows), where it stands in
-    ``sensordata``, and its unit.
+    """One row of a sensor's data.
+
+    Attributes:
+        name: name; such as ``force.x`` for a sensor with three rows.
+        address: address in ``sensordata``.
+        unit: unit of the value.
     """
 
     name: str
@@ -117,26 +118,26 @@ class SensorRow:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A model file that has been read.
+    """A robot read from a model file.
 
     Attributes:
-        path: of the file.
+        path: path of the model file.
         format: mjcf or urdf.
-        spec: what was read and mended, a mujoco.MjSpec; compile a copy of it and leave it as it is.
-        notes: what was mended or left out, one line each.
-        aliases: by link that is fused into another, the body that MuJoCo compiles.
-        digest: of all that was read, in hexadecimal digits.
-        rated: actuators whose second control is the rate of their first, to be put in with it.
-        actuator_tables: actuators that a recording added, by name, as it states them.
-        engine_table: step and integrator in place of the file's, as it states them.
-        speeds: of joints, the fastest that a URDF allows, rad/s or m/s; an MJCF states none.
-        series: of joints that were put in series with others (`sims.robot.series`), by name, the
-            inertia about them, kg or kg m^2; no other joint is in this model alone.
-        coupled: joints whose drives turn the joint before as well (`sims.robot.coupled`).
-        friction_form: of dry friction that effects add to the file's; the friction that the file
-            states alone keeps the file's solver parameters.
-        shapes: what is written into its compiled models, where their meshes are convex hulls.
-        kept: what functions `kept_with_robot` found of it.
+        spec: repaired mujoco.MjSpec; compile a copy of it and do not change it.
+        notes: notes about repairs and omissions, one line each.
+        aliases: body that MuJoCo compiles, by name of a link that is fused into it.
+        digest: digest of everything that was read, in hexadecimal digits.
+        rated: actuators whose second control is the rate of their first; the simulation sets it.
+        actuator_tables: actuators that a recording added, by name, as specified there.
+        engine_table: time step and integrator that a recording specified instead of the file's.
+        speeds: velocity limits of joints in a URDF, rad/s or m/s; an MJCF specifies none.
+        series: added joints in series with others (`sims.robot.series`): inertia about them by
+            name, kg or kg m^2; only these joints are not in the model file.
+        coupled: joints whose drives also drive the preceding joint (`sims.robot.coupled`).
+        friction_form: form of the dry friction that effects add; friction of the file without added
+            friction keeps the file's solver parameters.
+        shapes: data written into compiled models whose meshes are convex hulls.
+        kept: results of functions with the decorator `kept_with_robot`.
     """
 
     path: Path
@@ -157,12 +158,12 @@ class Robot:
 
     @cached_property
     def compiled(self) -> Any:
-        """The mujoco.MjModel; nobody writes into it."""
-        # A spec that has been compiled holds all meshes once more.
+        """The compiled mujoco.MjModel; it must not be changed."""
+        # A copy is compiled, since a compiled spec holds all meshes a second time.
         return self.compile(self.spec.copy())
 
     def compile(self, spec: Any) -> Any:
-        """Compile a spec of this robot, a mujoco.MjSpec."""
+        """Compile a mujoco.MjSpec of this robot."""
         with quiet():
             model = spec.compile()
         if self.shapes is not None:
@@ -170,15 +171,15 @@ class Robot:
         return model
 
     def with_friction_form(self, form: FrictionForm) -> Robot:
-        """The same robot, to which effects add dry friction in this form."""
+        """Return the robot with another form of the dry friction that effects add."""
         other = replace(self, friction_form=form)
-        # The form is no part of the compiled model, so that it need not be compiled again.
+        # The compiled model does not depend on the form, so it is reused.
         other.__dict__["compiled"] = self.compiled
         return other
 
     @property
     def name(self) -> str:
-        """Of the model, by its file."""
+        """Name of the robot: the file name without its suffix."""
         return self.path.stem
 
     @cached_property
@@ -239,14 +240,14 @@ class Robot:
 
     @cached_property
     def bodies(self) -> tuple[Body, ...]:
-        """The bodies that joints move, directly or through others."""
+        """Bodies that joints move, directly or through other bodies."""
         model = self.compiled
         fused: dict[str, list[str]] = {}
         for alias, name in (self.aliases or {}).items():
             fused.setdefault(name, []).append(alias)
         moving = []
         for i in range(1, model.nbody):
-            # Bodies welded to the world are part of it; those welded to others move with them.
+            # Bodies welded to the world do not move; those welded to other bodies move with them.
             if int(model.body_weldid[i]) == 0:
                 continue
             name = model.body(i).name or f"body{i}"
@@ -268,7 +269,7 @@ class Robot:
         return tuple(rows)
 
     def _unit(self, sensor: int) -> str:
-        """Of what a sensor shows; 1 where it is not known."""
+        """Return the unit of a sensor; 1 if unknown."""
         import mujoco
 
         model, of = self.compiled, mujoco.mjtSensor
@@ -282,29 +283,31 @@ class Robot:
         return _UNITS.get(kind, "1")
 
     def integrates(self, actuator: Actuator) -> bool:
-        """Whether an actuator's force follows the integral of its control, as ``intvelocity``."""
+        """Return whether an actuator integrates its control, such as ``intvelocity``."""
         import mujoco
 
         integrator = int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
         return int(self.compiled.actuator_dyntype[actuator.id]) == integrator
 
     def joint(self, name: str) -> Joint:
-        """The joint of this name.
+        """Return the joint with a name.
 
         Raises:
-            InputError: there is none; the message lists those that there are.
+            InputError: there is no such joint; the message lists the existing ones.
         """
         found: Joint = self._named("joint", name, {joint.name: joint for joint in self.joints})
         return found
 
     def actuator(self, name: str) -> Actuator:
-        """The actuator of this name; errors as in `joint`."""
+        """Return the actuator with a name; errors as in `joint`."""
         found: Actuator = self._named("actuator", name, {a.name: a for a in self.actuators})
         return found
 
     def body(self, name: str) -> Body:
-        """The body of this name, or into which the link of this name is fused; errors as in
-        `joint`.
+        """Return the body with a name, or the body into which a link with the name is fused.
+
+        Raises:
+            InputError: there is no such body; the message lists the existing ones.
         """
         bodies = {body.name: body for body in self.bodies}
         fused = (self.aliases or {}).get(name, name)
@@ -325,8 +328,9 @@ _T = TypeVar("_T")
 def kept_with_robot(
     function: Callable[Concatenate[Robot, _P], _T],
 ) -> Callable[Concatenate[Robot, _P], _T]:
-    """A function of a robot that is asked once for each robot and arguments: what it finds goes
-    with the robot. A cache of the module would hold every model that a process has read.
+    """Cache the results of a function of a robot in the robot itself, by arguments.
+
+    A cache of the module would hold every model that a process has read.
     """
 
     @wraps(function)
@@ -345,16 +349,16 @@ def _limit(values: Any, limited: bool) -> tuple[float, float] | None:
 
 
 def _kind(model: Any, i: int) -> Drive:
-    """What an actuator's control means, by its gain and its bias (MuJoCo's shortcuts)."""
+    """Return the kind of an actuator from its gain and bias (MuJoCo's shortcuts)."""
     import mujoco
 
     gain, bias = model.actuator_gainprm[i], model.actuator_biasprm[i]
     fixed = int(model.actuator_gaintype[i]) == int(mujoco.mjtGain.mjGAIN_FIXED)
     affine = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
     dynamics = int(model.actuator_dyntype[i])
-    # A filter changes when a control acts, not what it means.
+    # A filter changes when a control acts, but not its meaning.
     direct = dynamics == int(mujoco.mjtDyn.mjDYN_NONE) or dynamics in filters()
-    pid = getattr(mujoco.mjtGain, "mjGAIN_PID", None)  # since MuJoCo 4
+    pid = getattr(mujoco.mjtGain, "mjGAIN_PID", None)  # Available since MuJoCo 4.
     if pid is not None and int(model.actuator_gaintype[i]) == int(pid):
         return "pid"
     if not fixed or not direct:
@@ -387,14 +391,15 @@ _UNITS: Mapping[int, str] = {
     3: "rad/s",  # gyro
     4: "N",  # force
     5: "N*m",  # torque
-    26: "m",  # position of a frame
-    31: "m/s",  # its velocity
+    26: "m",  # frame position
+    31: "m/s",  # frame linear velocity
     32: "rad/s",
     33: "m/s^2",
     34: "rad/s^2",
     35: "m",  # centre of mass of a subtree
     36: "m/s",
 }
-"""Units of sensors, by the number of MuJoCo's mjtSensor; those of joints and actuators hang on what
-they are of.
+"""Units of sensors, by number of MuJoCo's mjtSensor.
+
+Units of joint and actuator sensors depend on their joint.
 """

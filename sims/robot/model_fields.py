@@ -1,4 +1,4 @@
-"""Where MuJoCo's compiled model keeps the number that a coefficient changes.
+"""Fields of MuJoCo's compiled model that store the numbers changed by effect coefficients.
 
 `sims.robot.native` writes these fields, `sims.robot.totals` reads the numbers in them.
 """
@@ -13,7 +13,7 @@ from sims.robot.model import Robot
 from sims.robot.native import gain_pulls
 
 Operation = Literal["abs", "add", "scale"]
-"""How a random number is applied to a field: it replaces, is added to, or multiplies the number."""
+"""Operation that applies a random number to a field: replace, add to, or multiply its number."""
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,10 @@ class ModelField:
     """An element of a field of mujoco.MjModel that holds a number of the model file.
 
     Attributes:
-        name: of the field, as ``dof_damping``; ``opt.gravity`` of the options.
+        name: name of the field, such as ``dof_damping``; ``opt.gravity`` for a field of the
+            options.
         address: index of the element.
-        sign: -1 where the field holds the negative of the number, as the bias of a servo.
+        sign: -1 if the field holds the negative of the number, such as the bias of a servo.
     """
 
     name: str
@@ -32,7 +33,7 @@ class ModelField:
 
 
 Find = Callable[[Robot, str], "list[list[ModelField]]"]
-"""The elements of each coefficient, by robot and place."""
+"""Function that finds the elements of each coefficient, by robot and place."""
 
 
 def _dof(name: str, *index: int) -> Find:
@@ -94,24 +95,27 @@ _OPERATIONS: Mapping[str, Operation] = {
     "inertia.scale": "scale",
     "gravity.scale": "scale",
 }
-"""Operations other than ``abs``: a position is moved, a tensor or a vector keeps its direction."""
+"""Operations other than ``abs``, by effect.
+
+A position is shifted. A tensor or a vector is scaled, so that it keeps its direction.
+"""
 
 
 def model_fields(robot: Robot, effect: str, place: str) -> list[list[ModelField]]:
     """Find the elements of the compiled model that an effect changes, by coefficient.
 
     Args:
-        robot: whose model.
+        robot: robot with the compiled model.
         effect: name of the effect, without its place.
         place: joint, actuator or body.
 
     Returns:
-        Of each coefficient the elements that hold its number, the main one first; empty where the
+        For each coefficient, the elements that hold its number, the main one first; empty if the
         model has no such number.
     """
     return _FIELDS[effect](robot, place) if effect in _FIELDS else []
 
 
 def operation_of(effect: str) -> Operation:
-    """Return how a drawn number is applied to the field of an effect."""
+    """Return how a random number is applied to the field of an effect."""
     return _OPERATIONS.get(effect, "abs")

@@ -1,4 +1,4 @@
-"""An instant of a robot, as effects see it: whole, or one joint alone."""
+"""Snapshots of the state of a robot, or of one of its joints, as effects receive them."""
 
 from __future__ import annotations
 
@@ -25,36 +25,35 @@ class OneJoint(System):
     sensed = ()
 
     def mass(self, theta: Array, constants: Any) -> Array:
-        """Not known of one joint alone."""
+        """Raise an error: the inertia is not known for one joint alone."""
         raise NotImplementedError
 
     def weight(self, moment: Moment) -> Array:
-        """Not known of one joint alone."""
+        """Raise an error: the gravity force is not known for one joint alone."""
         raise NotImplementedError
 
     def observe(self, x: Array, v: Array, a: Array, constants: Any) -> dict[str, Array]:
-        """Nothing by itself."""
+        """Raise an error: a joint alone has no channels."""
         raise NotImplementedError
 
 
 class Slide(OneJoint):
-    """The same of a joint that slides."""
+    """One slide joint of a robot, as a system of one coordinate."""
 
     kind: ClassVar[Kind] = "linear"
 
 
 @dataclass
 class JointMoment(Moment):
-    """One instant of one joint.
+    """State of one joint at one time.
 
     Attributes:
-        carried: (2, L, 1) what its transmission carries, the drive's force and what it works
-            against.
-        goal: (L, 1) set point of its position servo; NaN without one.
-        stiffness: (L, 1) what that exerts for each unit of its error.
-        gear: by how much it turns for each unit of the joint's position.
-        shared: (L, 1) sizes of the forces of all drives of the robot; None where its drive has a
-            supply of its own.
+        carried: (2, L, 1) forces on both sides of its transmission: the drive, and the load.
+        goal: (L, 1) set point of its position servo; NaN without a servo.
+        stiffness: (L, 1) force of the servo per unit of its error.
+        gear: set point of the servo per unit of the joint's position.
+        shared: (L, 1) absolute forces of all drives of the robot; None if the drive has its own
+            supply.
     """
 
     carried: Array = field(default_factory=lambda: np.zeros((2, 0, 1)))
@@ -65,41 +64,44 @@ class JointMoment(Moment):
 
     @property
     def drawn(self) -> Array:
-        """See `Moment`."""
+        """Load of the power supply, see `Moment`."""
         return super().drawn if self.shared is None else self.shared
 
     @property
     def load(self) -> Array:
-        """(L, 1) what the transmission carries, whichever way."""
+        """Absolute load of the transmission, (L, 1)."""
         load: Array = np.abs(self.carried[0] + self.carried[1])
         return load
 
     @property
     def sides(self) -> tuple[Array, Array]:
-        """See `Moment`."""
+        """Forces on both sides of the transmission, see `Moment`."""
         return self.carried[0], self.carried[1]
 
     @property
     def error(self) -> Array:
-        """See `Moment`."""
+        """Error of the position servo, see `Moment`."""
         return self.goal - self.gear * self.x
 
     def aimed(self, shift: Array) -> Array:
-        """See `Moment`; a limit of the actuator's force is not in it."""
+        """Return the additional drive force for a shifted set point, see `Moment`.
+
+        It does not include force limits of the actuator.
+        """
         return self.stiffness * shift
 
 
 @dataclass
 class RobotMoment(Moment):
-    """One instant of every lane of a robot.
+    """State of a robot at one time, for all batch elements.
 
     Attributes:
-        carried: (2, L, D) what each joint's transmission carries: the drive from one side, and
-            gravity and what comes of the motion of the other bodies from the other.
-        alone: (D,) each joint as a system of its own.
-        drives: by coordinate, the inputs of its actuators.
-        servos: by coordinate, the input that is the set point of its position servo.
-        stiffness: (L, D) what position servos exert for each unit of their errors; zero without.
+        carried: (2, L, D) forces on both sides of each joint's transmission: the drive; and the
+            load by gravity and the motion of the other bodies.
+        alone: (D,) each joint as a separate system.
+        drives: inputs of the actuators of each coordinate.
+        servos: input that is the set point of the position servo, by coordinate.
+        stiffness: (L, D) forces of position servos per unit of their errors; zero without a servo.
     """
 
     carried: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
@@ -109,7 +111,7 @@ class RobotMoment(Moment):
     stiffness: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def only(self, lane: int) -> RobotMoment:
-        """One lane alone."""
+        """Select one batch element."""
         own = slice(lane, lane + 1)
         return replace(
             self,
@@ -123,7 +125,7 @@ class RobotMoment(Moment):
         )
 
     def of_joint(self, joint: int) -> JointMoment:
-        """The instant as one joint sees it."""
+        """Return the snapshot of one joint."""
         one = slice(joint, joint + 1)
         inputs = {
             name: self.inputs[name] for name in self.drives.get(joint, ()) if name in self.inputs

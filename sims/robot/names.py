@@ -1,5 +1,7 @@
-"""Names of a model's parts, as places need them: each has one, and none holds what divides the
-words of a place or an option.
+"""Unique, valid names of model elements.
+
+Effect places refer to elements by name. So every element needs a name, without the characters that
+separate the parts of a place or of an option.
 """
 
 from __future__ import annotations
@@ -10,13 +12,23 @@ from xml.etree.ElementTree import Element
 from sims.robot.words import listed
 
 DIVIDING = "@=,*"
-"""``friction.coulomb@elbow=0.3``, ``--free damping@*,mass@forearm``."""
+"""Characters with a meaning in places and options, which names must not contain.
+
+Examples: ``friction.coulomb@elbow=0.3`` and ``--free damping@*,mass@forearm``.
+"""
 FREE = ("file", "class", "childclass", "filename")
-"""Attributes whose values are no names of parts."""
+"""XML attributes whose values are not names of elements."""
 
 
 def renamed(root: Element) -> list[str]:
-    """Rename what cannot be a place, wherever it is named."""
+    """Rename elements whose names contain `DIVIDING` characters, and all references to them.
+
+    Args:
+        root: root element of the model file; it is changed in place.
+
+    Returns:
+        Notes, at most one.
+    """
     named = {element.get("name") or "" for element in root.iter()}
     changed: dict[str, str] = {}
     for name in sorted(named):
@@ -37,8 +49,13 @@ def renamed(root: Element) -> list[str]:
 
 
 def given(spec: Any) -> list[str]:
-    """Name the joints, actuators, bodies and sensors of a spec that have no name, by their numbers
-    in the file.
+    """Name unnamed joints, actuators, bodies and sensors of a spec by their numbers in the file.
+
+    Args:
+        spec: the mujoco.MjSpec; it is changed in place.
+
+    Returns:
+        Notes, one for each kind of element with new names.
     """
     notes = []
     kinds = {

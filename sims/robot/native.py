@@ -1,13 +1,14 @@
-"""Effects that MuJoCo has in its model: which fields of a compiled model each of them changes, and
-how, for many lanes at once.
+"""Effects that are written into fields of the compiled MuJoCo model of a batch.
 
-With c the coefficient, and what the model file states before it, at a joint, an actuator or a body:
+With the coefficient c, and the value that the model file specifies at a joint, an actuator or a
+body:
 
-* (1) added: stated + c, never below zero: dampings, dry friction, stiffness, armature
-* (2) scaled: stated times 1 + c, with 1 + c never below `SMALLEST`
-* (3) moved: the centre of mass by c (3 numbers, m) in the body's frame
-* (4) tilted: gravity plus g x along x and g y along y, g what the file states, as a size
-* (5) limited: the file's range cut to -c ... c; a limit of zero is none
+* (1) Added: value + c, at least zero: damping, dry friction, stiffness, armature.
+* (2) Scaled: value times 1 + c, with 1 + c at least `SMALLEST`.
+* (3) Moved: the centre of mass is moved by c (3 numbers, m) in the body frame.
+* (4) Tilted: gravity plus g c_x along x and g c_y along y, with the magnitude g of the file's
+  gravity.
+* (5) Limited: the file's range restricted to [-c, c]; a limit of zero has no effect.
 """
 
 from __future__ import annotations
@@ -22,36 +23,38 @@ from sims.base import Array
 from sims.robot.model import TENDON, Robot
 
 SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""`solimp` of stiff dry friction: the hardest that MuJoCo allows, so that a joint at rest hardly
-creeps.
+"""Parameter `solimp` of stiff dry friction: the hardest value that MuJoCo allows.
+
+With it a joint at rest hardly creeps.
 """
 SOFT = -1e-9
-"""In place of a stiffness, which dry friction has none of: so that MuJoCo reads the second number
-as a damping.
+"""Placeholder for the stiffness in `solref` of dry friction, which has no stiffness.
+
+The negative value makes MuJoCo read the second number as a damping.
 """
 RK4 = 1
-"""MuJoCo's number of the integrator."""
+"""MuJoCo's number of the Runge-Kutta 4 integrator."""
 
 SMALLEST = 1e-6
-"""The least share of a mass or a gain that is left, so that none is zero or negative."""
+"""Minimum factor of a mass or a gain, so that none becomes zero or negative."""
 
 Fields = Mapping[str, Any]
-"""Model fields by name, arrays (L, ...) of the lanes."""
+"""Model fields of L batch elements by name, arrays (L, ...)."""
 
 Write = Callable[[Fields, Robot, str, Array], None]
-"""Changes fields in place: of the robot, at the place, by coefficients (K, L)."""
+"""Function that changes fields in place, from robot, place and coefficients (K, L)."""
 
 
 @dataclass(frozen=True)
 class Native:
-    """An effect that is written into the model.
+    """An effect that is written into fields of the model.
 
     Attributes:
-        fields: that it writes, as ``mujoco.batch.Batch.expand`` names them.
-        write: what it does to them; the fields hold what the file states, or what another effect
-            has made of it.
-        derived: whether constants are derived from the fields, so that ``set_const`` must follow;
-            it does so only in a model of `lanes_model`.
+        fields: names of the fields, as in ``mujoco.batch.Batch.expand``.
+        write: changes the fields, which contain the values of the file or the result of another
+            effect.
+        derived: whether MuJoCo derives constants from the fields, so that ``set_const`` must be
+            called; this requires a model of `lanes_model`.
     """
 
     fields: tuple[str, ...]
@@ -60,16 +63,16 @@ class Native:
 
 
 def lanes_model(robot: Robot) -> Any:
-    """The compiled model whose masses and centres of mass may be changed lane by lane.
+    """Compile the model such that masses and centres of mass can differ between batch elements.
 
-    MuJoCo stores less for a body that turns about its centre of mass, and refuses to move that
-    centre afterwards; here it stores all. The motion is the same.
+    MuJoCo stores less for a body that turns about its centre of mass, and then rejects changes of
+    its centre of mass. Here it stores everything. The motion is the same.
     """
     return robot.compile(lanes_spec(robot))
 
 
 def lanes_spec(robot: Robot) -> Any:
-    """The mujoco.MjSpec of `lanes_model`."""
+    """Make the mujoco.MjSpec of `lanes_model`."""
     spec = robot.spec.copy()
     for body in spec.bodies:
         body.simple = False
@@ -77,17 +80,29 @@ def lanes_spec(robot: Robot) -> Any:
 
 
 def stiff(timestep: float, integrator: int) -> tuple[float, float]:
-    """What dry friction has for `solref`: it takes the velocity away within a step, and no more.
+    """Return `solref` of stiff dry friction, which stops a velocity within one step.
 
-    Friction acts with a time constant 1 / b. A step of Euler or of the implicit integrators has it
-    all with b = 1 / h, beyond which it overshoots; the four looks of RK4 bear b = 2.5 / h, and 3
-    chatters. MuJoCo's own, 0.02 s, creeps at rest.
+    Friction acts with a time constant 1 / b. A step of Euler or of the implicit integrators stops
+    the velocity completely with b = 1 / h, and overshoots beyond it. The four evaluations of RK4
+    tolerate b = 2.5 / h, and 3 / h chatters. MuJoCo's default time constant, 0.02 s, creeps at
+    rest.
+
+    Args:
+        timestep: time step h in seconds.
+        integrator: MuJoCo's number of the integrator.
     """
     return (SOFT, -2.5 / timestep) if integrator == RK4 else (2.0 * timestep, 1.0)
 
 
 def stiff_of(fields: Fields, robot: Robot) -> tuple[float, float]:
-    """The same of lanes, whose step stands among the fields or is the file's."""
+    """Return `solref` of stiff dry friction for a batch.
+
+    Time step and integrator are taken from the fields if they contain them, else from the file.
+
+    Args:
+        fields: model fields of the batch elements.
+        robot: robot with the model file.
+    """
     option = robot.compiled.opt
     step = fields["opt.timestep"][0] if "opt.timestep" in fields else option.timestep
     kind = fields["opt.integrator"][0] if "opt.integrator" in fields else option.integrator
@@ -98,9 +113,9 @@ def write_friction_form(fields: Fields, robot: Robot, lanes: Any, dofs: Any) -> 
     """Set the solver parameters of dry friction that effects add, in the form of the robot.
 
     Args:
-        fields: model fields of the lanes, changed in place.
-        robot: its `friction_form` decides; ``soft`` leaves the parameters of the file.
-        lanes: index of the lanes.
+        fields: model fields of the batch elements, changed in place.
+        robot: its `friction_form` decides; ``soft`` keeps the parameters of the file.
+        lanes: index of the batch elements.
         dofs: index of the joints' velocities.
     """
     if robot.friction_form == "soft":
@@ -110,17 +125,17 @@ def write_friction_form(fields: Fields, robot: Robot, lanes: Any, dofs: Any) -> 
 
 
 def added(stated: Any, c: Any) -> Any:
-    """(1); a number below zero that the file states may stay."""
+    """Add a coefficient to a value by (1); a negative value in the file may remain."""
     return np.maximum(stated + c, np.minimum(stated, 0.0))
 
 
 def share(c: Any) -> Any:
-    """1 + c of (2)."""
+    """Return the factor 1 + c of (2)."""
     return np.maximum(1.0 + c, SMALLEST)
 
 
 def _add_dof(field: str) -> Write:
-    """Adds to a number of a joint's velocity."""
+    """Make a function that adds the coefficient to a field of a joint's degree of freedom."""
 
     def write(fields: Fields, robot: Robot, place: str, c: Array) -> None:
         column = robot.joint(place).velocity
@@ -130,7 +145,7 @@ def _add_dof(field: str) -> Write:
 
 
 def _add_quadratic(fields: Fields, robot: Robot, place: str, c: Array) -> None:
-    # The polynomial's first number is that of |v| v.
+    # The first number of the polynomial multiplies |v| v.
     column = fields["dof_dampingpoly"][:, robot.joint(place).velocity]
     column[:, 0] = added(column[:, 0], c[0])
 
@@ -138,7 +153,7 @@ def _add_quadratic(fields: Fields, robot: Robot, place: str, c: Array) -> None:
 def _add_friction(fields: Fields, robot: Robot, place: str, c: Array) -> None:
     column = robot.joint(place).velocity
     loss = fields["dof_frictionloss"]
-    # Less friction than the file states has the file's form.
+    # A reduced friction keeps the solver parameters of the file.
     rubs = c[0] > 0
     loss[:, column] = added(loss[:, column], c[0])
     write_friction_form(fields, robot, rubs, column)
@@ -151,7 +166,8 @@ def _add_spring(fields: Fields, robot: Robot, place: str, c: Array) -> None:
 
 
 def _add_cubic(fields: Fields, robot: Robot, place: str, c: Array) -> None:
-    # The polynomial's second number is that of x^3; a spring may soften, so it has no floor.
+    # The second number of the polynomial multiplies x^3. It has no lower limit, since a spring may
+    # soften.
     fields["jnt_stiffnesspoly"][:, robot.joint(place).id, 1] += c[0]
 
 
@@ -186,19 +202,25 @@ def _scale_damping(fields: Fields, robot: Robot, place: str, c: Array) -> None:
 
 
 def gain_pulls(robot: Robot, number: int, term: int) -> bool:
-    """Whether an actuator's control is a set point of its position (term 1) or velocity (2)."""
+    """Return whether an actuator's control is a set point of position (1) or velocity (2).
+
+    Args:
+        robot: robot with the actuator.
+        number: number of the actuator.
+        term: index in `biasprm`: 1 for the position, 2 for the velocity.
+    """
     import mujoco
 
     model = robot.compiled
     gain, bias = model.actuator_gainprm[number], model.actuator_biasprm[number]
     fixed = int(model.actuator_gaintype[number]) == int(mujoco.mjtGain.mjGAIN_FIXED)
-    # Where it has a stiffness as well, the set point is multiplied by that one.
+    # With a position gain as well, the set point is multiplied by the position gain.
     return bool(fixed and gain[0] == -bias[term] and (term == 1 or bias[1] == 0))
 
 
 def _scale_gravity(fields: Fields, robot: Robot, place: str, c: Array) -> None:  # noqa: ARG001
     gravity = fields["opt.gravity"]
-    # What a tilt has added is no part of what is scaled.
+    # The tilt that another effect added is not scaled.
     gravity += c[0][:, None] * robot.compiled.opt.gravity
 
 
@@ -208,8 +230,11 @@ def _tilt_gravity(fields: Fields, robot: Robot, place: str, c: Array) -> None:  
 
 
 def arm_of(robot: Robot, place: str) -> int:
-    """Where in `wrap_prm` a robot whose drives are coupled has by how much that of a joint turns
-    the joint before.
+    """Return the address in `wrap_prm` of the coupling coefficient of a joint's drive.
+
+    Args:
+        robot: robot with coupled drives.
+        place: joint of the drive.
     """
     model = robot.compiled
     return int(model.tendon_adr[model.tendon(place + TENDON).id]) + 1
@@ -232,7 +257,7 @@ def _limit_force(fields: Fields, robot: Robot, place: str, c: Array) -> None:
 
 
 COUPLING = "wrap_prm"
-"""Of the fields the one that a model without tendons lacks."""
+"""Model field of coupling coefficients, which a model without tendons lacks."""
 _SERVO = ("actuator_gainprm", "actuator_biasprm")
 
 FIELDS: Mapping[str, Native] = {
@@ -252,4 +277,7 @@ FIELDS: Mapping[str, Native] = {
     "joint.coupling": Native((COUPLING,), _couple),
     "actuator.limit": Native(("actuator_forcelimited", "actuator_forcerange"), _limit_force),
 }
-"""Native effects by name, each at a place of its kind; the world's take any place, as ``""``."""
+"""Model-field effects by name.
+
+Each acts at a place of its kind, and those of the world at any place, such as ``""``.
+"""

@@ -1,4 +1,4 @@
-"""How MuJoCo steps a robot: time step and integrator."""
+"""Time step and integrator with which MuJoCo simulates a robot."""
 
 from __future__ import annotations
 
@@ -8,22 +8,27 @@ from sims.robot.model import Robot
 from sims.system import Lanes, Motion, System
 
 INTEGRATORS = {"Euler": 0, "RK4": 1, "implicit": 2, "implicitfast": 3}
-"""MuJoCo's integrators, by their names in a model file."""
+"""Numbers of MuJoCo's integrators (mjtIntegrator), by their names in a model file."""
 
 
 class Numerics(NamedTuple):
-    """How MuJoCo steps: seconds, and the integrator's name."""
+    """Integrator settings of MuJoCo.
+
+    Attributes:
+        timestep: time step in seconds.
+        integrator: name of the integrator, a key of `INTEGRATORS`.
+    """
 
     timestep: float
     integrator: str
 
     def settings(self) -> dict[str, float]:
-        """As options of a model."""
+        """Return the settings as fields of a model's options (`mujoco.MjOption`)."""
         return {"timestep": self.timestep, "integrator": INTEGRATORS[self.integrator]}
 
 
 class RobotEngine:
-    """MuJoCo at the model's own step; `RobotSimulator` steps it."""
+    """MuJoCo at the time step of the model; `RobotSimulator` does the simulation."""
 
     name = "mujoco"
     requires: tuple[str, ...] = ("mujoco",)
@@ -33,19 +38,19 @@ class RobotEngine:
         self.largest_step = numerics.timestep
 
     def integrate(self, lanes: Lanes) -> Motion:
-        """Not for anything but robots."""
+        """Raise an error: robots are simulated by `RobotSimulator`, not through this interface."""
         raise NotImplementedError
 
     def refuses(self, system: type[System]) -> str:
-        """Everything that has no model file."""
+        """Return why this engine cannot simulate a system; empty if it can."""
         return "" if system.has_model else "it has no model file"
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Do nothing, since the engine holds no resources."""
 
 
 def own_numerics(robot: Robot) -> Numerics:
-    """How the robot's file says that it is stepped."""
+    """Return the integrator settings that the robot's model file specifies."""
     option = robot.compiled.opt
     names = {number: name for name, number in INTEGRATORS.items()}
     return Numerics(float(option.timestep), names[int(option.integrator)])

@@ -1,9 +1,10 @@
-"""Effects at the places of a robot: each registered effect becomes a class for every joint,
-actuator, body or channel where it can act, named ``effect@place``, and one for all of them
-together, the family ``effect@*``.
+"""Effect classes for each place of a robot, and effect families over all places.
 
-An effect knows nothing of robots. At a joint it sees that joint alone, as a system of one
-coordinate; at an actuator or a channel it gets that signal. A family is the sum of its members.
+Each registered effect becomes a class for every joint, actuator, body or channel where it can act,
+named ``effect@place``, and one class for all of them together, the family ``effect@*``.
+
+An effect does not depend on robots. At a joint it receives that joint alone, as a system of one
+coordinate; at an actuator or a channel it receives that signal. A family is the sum of its members.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from sims.system import (
 )
 
 SHARED = frozenset({"input.delay", "input.hold", "input.lag", "sensor.delay", "sensor.lag"})
-"""Families of one coefficient for all places: what is late is late everywhere."""
+"""Families with one coefficient for all places, such as delays."""
 ALONE = frozenset(
     {
         "force.periodic",
@@ -55,28 +56,31 @@ ALONE = frozenset(
         "state.limit",
     }
 )
-"""Effects without a family: what shapes them differs from place to place."""
+"""Effects without a family, since their shape parameters differ between places."""
 COMMON = frozenset({"supply.sag"})
-"""Effects at actuators that they may have in common, as a battery: the world's, by one number."""
+"""Effects at actuators that the actuators may share, such as a battery; one number of the world."""
 ENCODERS = frozenset({"sensor.slip"})
-"""Effects on what counts a position, and on no other channel."""
+"""Effects of position encoders, which act on no other channel."""
 TYPICAL = {"hinge": 0.5, "slide": 5.0}
-"""A force for which the plausible ranges of the library are meant: N m on a hinge, N on a slide."""
+"""Reference force for the plausible ranges of the effect library: N m on a hinge, N on a slide."""
 SHAPES = 6
-"""Sizes tried of what shapes an effect with a state: each is followed through time."""
+"""Number of values tried for a shape parameter of a hidden-state effect.
+
+It is small since each value requires an integration over time.
+"""
 SLOWEST = 15.0
-"""rad/s; what is carried swings no slower on a joint that gives."""
+"""Minimum natural frequency of the load on a flexible joint, in rad/s."""
 _KINDS: Mapping[str, Kind] = {"hinge": "rotary", "slide": "linear"}
 
 
 def at_world(effect: type[Effect]) -> type[Effect]:
-    """The effect as one of the world's, with the units that it has on any kind of system."""
+    """Make an effect of the world, with the units that it has on any kind of system."""
     coefficients = [_everywhere(c) for c in effect.coefficients]
     return _made(effect, effect.name, "", coefficients, {})
 
 
 def at_place(effect: type[Effect], spot: Spot) -> type[Effect]:
-    """The effect at one place."""
+    """Make the class of an effect at one place."""
     coefficients = [_of_spot(effect, c, spot) for c in effect.coefficients]
     changed: dict[str, Any] = {"coordinate": spot.coordinate, "signal": spot.signal}
     changed["says"] = f"{effect.says} (at {spot.words})"
@@ -89,7 +93,7 @@ def at_place(effect: type[Effect], spot: Spot) -> type[Effect]:
         declared = effect.between or effect.coefficients
         coefficients = [_tried(_of_spot(effect, c, spot)) for c in declared if not _has(spot, c)]
         own = [f"{other}@{spot.name}" for other in effect.contains]
-        # What the drive weighs, where it gives nothing.
+        # A rigid transmission with the drive's inertia is the armature effect.
         drive = f"inertia.armature@{spot.name}"
         for number, c in enumerate(coefficients):
             if c.of == "rotor":
@@ -101,7 +105,7 @@ def at_place(effect: type[Effect], spot: Spot) -> type[Effect]:
 
 def _force_of(effect: type[Force]) -> Callable[[Force, Array, Moment], Array]:
     def force(self: Force, c: Array, moment: Moment) -> Array:
-        """(L, D) along its joint."""
+        """Compute the force (L, D) along the joint of the effect."""
         joint = cast(int, self.coordinate)
         alone = cast(RobotMoment, moment).of_joint(joint)
         result = np.zeros_like(moment.x)
@@ -112,7 +116,12 @@ def _force_of(effect: type[Force]) -> Callable[[Force, Array, Moment], Array]:
 
 
 def at_all(effect: type[Effect], drives: Sequence[Spot]) -> Iterator[type[Effect]]:
-    """The effect as all drives have it in common, where they are of one kind."""
+    """Yield the class of an effect that all drives share, if they are of one kind.
+
+    Args:
+        effect: registered effect.
+        drives: places of the actuators.
+    """
     joints = {one.coordinate: one for one in drives}
     kinds = {one.kind for one in drives}
     if len(joints) < 2 or len(kinds) > 1 or not issubclass(effect, Force):
@@ -129,7 +138,7 @@ def at_all(effect: type[Effect], drives: Sequence[Spot]) -> Iterator[type[Effect
 
 def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., Array]:
     def force(self: Force, c: Array, moment: Moment) -> Array:
-        """(L, D) along the joints, each with what all draw."""
+        """Compute the forces (L, D) along the joints, each from the total load of the supply."""
         robot = cast(RobotMoment, moment)
         drawn = sum(np.abs(robot.carried[0][:, joint : joint + 1]) for joint in joints)
         result = np.zeros_like(moment.x)
@@ -143,7 +152,7 @@ def _force_of_all(effect: type[Force], joints: Sequence[int]) -> Callable[..., A
 
 def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, Moment], Array]:
     def limit(self: Friction, c: Array, moment: Moment) -> Array:
-        """(L, 1) of its joint."""
+        """Compute the friction limit (L, 1) of the effect's joint."""
         alone = cast(RobotMoment, moment).of_joint(cast(int, self.coordinate))
         return effect.limit(self, c, alone)
 
@@ -151,7 +160,7 @@ def _limit_of(effect: type[Friction]) -> Callable[[Friction, Array, Moment], Arr
 
 
 def _has(spot: Spot, c: Coefficient) -> bool:
-    """Whether the file states what a coefficient is of."""
+    """Return whether the model file specifies the quantity of a coefficient."""
     stated = spot.stated.get("inertia.armature", 0.0)
     return c.of == "rotor" and stated > c.plausible[0][0] * spot.inertia
 
@@ -160,7 +169,7 @@ def _taking(
     drive: str, inertia: float, number: int, bounds: tuple[float, float]
 ) -> Callable[[Effect, Array, str, Array], Array]:
     def taking(_: Effect, c: Array, simpler: str, given: Array) -> Array:
-        """With the drive's inertia as that of the rotor, a share of the joint's."""
+        """Convert the inertia of an armature effect to the rotor's share of the joint inertia."""
         if simpler != drive:
             return c
         made: Array = c.copy()
@@ -171,7 +180,7 @@ def _taking(
 
 
 def _tried(c: Coefficient) -> Coefficient:
-    """With a few sizes from which a search begins, where it shapes an effect with a state."""
+    """Add start values of a search to a shape parameter of a hidden-state effect."""
     low, high = c.plausible[0]
     if c.tried or low <= 0:
         return c
@@ -180,7 +189,7 @@ def _tried(c: Coefficient) -> Coefficient:
 
 def _act_of(effect: type[Hidden]) -> Callable[..., tuple[Array, Array]]:
     def act(self: Hidden, c: Array, moment: Moment, state: State) -> tuple[Array, Array]:
-        """(L, D) along its joint, and the rate of its state."""
+        """Compute the force (L, D) along the effect's joint, and the rate of its hidden state."""
         joint = cast(int, self.coordinate)
         alone = cast(RobotMoment, moment).of_joint(joint)
         result = np.zeros_like(moment.x)
@@ -192,7 +201,12 @@ def _act_of(effect: type[Hidden]) -> Callable[..., tuple[Array, Array]]:
 
 
 def family(effect: type[Effect], members: Sequence[type[Effect]]) -> type[Effect]:
-    """The effect at all of its places at once, a coefficient for each, or one for all."""
+    """Make the family of an effect: all its places, with one coefficient each or a shared one.
+
+    Args:
+        effect: registered effect.
+        members: classes of the effect at each place.
+    """
     shared = effect.name in SHARED
     first = members[0].coefficients
     coefficients: list[Coefficient] = list(first) if shared else []
@@ -204,7 +218,7 @@ def family(effect: type[Effect], members: Sequence[type[Effect]]) -> type[Effect
     instances = tuple(member() for member in members)
 
     def parts(_: Effect, c: Array) -> Acting:
-        """Each member with its own part of the coefficients."""
+        """Return the members with their coefficients."""
         if shared:
             return tuple((one, c) for one in instances)
         return tuple((one, c[i * count : (i + 1) * count]) for i, one in enumerate(instances))
@@ -246,13 +260,13 @@ def _made(
 
 
 def _everywhere(c: Coefficient) -> Coefficient:
-    """With one unit and range for every kind of system: the first that it has."""
+    """Give a coefficient one unit and range for all kinds of systems: the first that it has."""
     i = next(k for k, unit in enumerate(c.units) if unit is not None)
     return replace(c, units=(c.units[i],) * 3, plausible=(c.plausible[i],) * 3)
 
 
 def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
-    """A coefficient with the unit and the plausible range that it has at a place."""
+    """Give a coefficient the unit and the plausible range that apply at a place."""
     i = 2 if spot.kind == "hinge" else 1
     unit, (low, high) = c.units[i], c.plausible[i]
     least = c.least
@@ -260,7 +274,7 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
         unit = c.of.replace("error", "input").replace("input", spot.unit)
     elif c.of.startswith("reading"):
         unit = c.of.replace("reading", spot.unit)
-    # What the library calls plausible is meant for small joints: a force here may be larger.
+    # Plausible ranges of the library refer to small joints, so forces are scaled with the joint.
     if unit is None:
         unit = "1"
     share = spot.size / TYPICAL[spot.kind]
@@ -275,7 +289,8 @@ def _of_spot(effect: type[Effect], c: Coefficient, spot: Spot) -> Coefficient:
     most = c.most
     stated = spot.stated.get(effect.name) if effect.at == "joint" else None
     if stated is not None:
-        # The total is not negative: the difference may take away what the file states, and no more.
+        # The total must not be negative, so the difference can at most remove the value of the
+        # file.
         high = max(high, 2.0 * abs(stated))
         low = least = min(0.0 - stated, 0.0)
     if effect.name == "mass.offset":
@@ -291,13 +306,13 @@ def classes(
     native: Collection[str],
     compiles: Callable[[type[Effect]], bool] = lambda _: True,
 ) -> Iterator[type[Effect]]:
-    """An effect at all places of a robot where it can act, then its family.
+    """Yield the classes of an effect at all places of a robot, followed by its family.
 
     Args:
-        effect: registered.
-        found: the robot's places.
+        effect: registered effect.
+        found: places of the robot by kind.
         native: effects that the engine writes into the model.
-        compiles: whether the model compiles that an effect at one place needs.
+        compiles: returns whether the model with an effect at one place compiles.
     """
     if effect.at == "world":
         if effect.name in native or (issubclass(effect, Sensor) and not effect.filters):
@@ -308,7 +323,7 @@ def classes(
     members = [at_place(effect, s) for s in found[effect.at] if _acts_at(effect, s, found)]
     members = [member for member in members if compiles(member)]
     yield from members
-    # Encoders are of one make; what else is recorded has units of its own.
+    # Position channels of encoders are alike, while other channels have units of their own.
     alike = [m for m in members if effect.at != "channel" or m.place.startswith("q.")]
     if len(alike) > 1 and effect.name not in ALONE:
         yield family(effect, alike)
@@ -317,36 +332,36 @@ def classes(
 
 
 def _for_one(effect: type[Effect]) -> bool:
-    """Whether it can act at one of several places without the engine's help."""
+    """Return whether an effect can act at one of several places without the engine's support."""
     if issubclass(effect, Input | Sensor):
         return True
-    # A force that asks for more than its own joint has no meaning at one of several.
+    # A force that needs more than its own joint is undefined at one of several joints.
     alone = effect.needs in ("", "guide", "input", "servo")
     if issubclass(effect, Hidden):
-        # What has a part of the joint's inertia needs to say what it is between.
+        # An effect with a share of the joint's inertia must declare what it connects.
         return bool(effect.between) or effect.behind is Hidden.behind
     return alone and issubclass(effect, Force | Friction)
 
 
 def _acts_at(effect: type[Effect], spot: Spot, found: Mapping[str, Sequence[Spot]]) -> bool:
-    """Whether a place has what the effect changes."""
+    """Return whether a place has the quantity that an effect changes."""
     if effect.at == "joint" and effect.coefficients[0].unit(_KINDS[spot.kind]) is None:
         return False
     if effect.at == "joint" and effect.needs == "input":
         return any(actuator.coordinate == spot.coordinate for actuator in found["actuator"])
     if issubclass(effect, Hidden) and effect.between:
-        # Between what drives a joint and what it carries.
+        # The effect connects the drive of a joint to its load, so both must exist.
         return spot.last and any(one.coordinate == spot.coordinate for one in found["actuator"])
     if effect.needs == "servo" and not spot.servo:
         return False
     if effect.name == "joint.coupling" and not spot.coupled:
         return False
-    # A set point has no power.
+    # A power effect is undefined for a set point.
     if effect.name == "input.power" and not spot.unit.startswith(("N", "1")):
         return False
     if effect.name in ENCODERS and not spot.name.startswith("q."):
         return False
-    # What is an angle to an encoder is none to what else is recorded.
+    # Angular coefficients apply to encoders, and not to other channels.
     if effect.at == "channel" and not effect.coefficients[0].of:
         unit = effect.coefficients[0].unit(_KINDS[spot.kind])
         if unit is None or (unit == "rad" and spot.unit != "rad"):

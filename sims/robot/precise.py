@@ -1,4 +1,4 @@
-"""A model as MuJoCo writes it, with all digits, and models compared number by number."""
+"""Save MuJoCo models with full precision, and compare compiled models field by field."""
 
 from __future__ import annotations
 
@@ -10,21 +10,26 @@ from typing import Any
 import numpy as np
 
 DIGITS = 17
-"""With which every number is read as what it was."""
+"""Number of significant digits with which every float64 number is read back exactly."""
 
 _TEXTS = ("name", "path", "text", "signature", "tex_data", "nbuffer")
-"""Parts of the names of fields that say nothing of motion."""
+"""Parts of the names of model fields that do not influence the motion."""
 
 
 def saved(spec: Any, folder: Path) -> str:
-    """The spec as MJCF, in the notation in which it was stated, its files found from anywhere.
+    """Format a spec as MJCF with full precision and absolute asset folders.
+
+    Angles and other values keep the notation in which the model file states them.
 
     Args:
-        spec: a mujoco.MjSpec that has been compiled, not to be used afterwards.
-        folder: to which its files are relative.
+        spec: a compiled mujoco.MjSpec; it must not be used afterwards.
+        folder: folder to which the paths of its assets are relative.
+
+    Returns:
+        The MJCF text.
 
     Raises:
-        RuntimeError: this MuJoCo cannot be told how many digits to write.
+        RuntimeError: this MuJoCo library has no function that sets the number of digits.
     """
     spec.meshdir = str(folder / spec.meshdir)
     spec.texturedir = str(folder / spec.texturedir)
@@ -44,7 +49,7 @@ def saved(spec: Any, folder: Path) -> str:
 
 @cache
 def _library() -> Any:
-    """MuJoCo's library, which is loaded already; its Python module has no word for the digits."""
+    """Load MuJoCo's shared library; its Python module does not expose the number of digits."""
     import mujoco
 
     folder = Path(mujoco.__file__).parent
@@ -54,12 +59,15 @@ def _library() -> Any:
 
 
 def unlike(one: Any, other: Any, tolerance: float) -> str | None:
-    """The first field in which two compiled models differ, with both; None where none does.
+    """Find the first field in which two compiled models differ.
 
     Args:
         one: a mujoco.MjModel.
-        other: another.
-        tolerance: difference that is rounding, relative to the largest of a field.
+        other: another mujoco.MjModel.
+        tolerance: difference that counts as rounding, relative to the largest value of a field.
+
+    Returns:
+        The name of the field with both values, or None if the models are equal.
     """
     for prefix, this, that in (("", one, other), ("opt.", one.opt, other.opt)):
         for name in sorted(dir(this)):

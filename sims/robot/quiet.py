@@ -1,6 +1,4 @@
-"""MuJoCo, kept quiet: its warnings are collected, its errors become one line, and neither its
-printing nor its log file happens.
-"""
+"""Capture MuJoCo's warnings and errors, so that it neither prints them nor writes a log file."""
 
 from __future__ import annotations
 
@@ -12,10 +10,13 @@ from contextlib import contextmanager
 
 @contextmanager
 def quiet() -> Iterator[list[str]]:
-    """Collects the warnings that MuJoCo gives within the block, each as one line.
+    """Collect the warnings that MuJoCo issues within the block, each as one line.
 
-    Without a handler MuJoCo prints warnings and appends them to ``MUJOCO_LOG.TXT`` in the folder
-    where the program runs.
+    Without a handler MuJoCo prints warnings and appends them to ``MUJOCO_LOG.TXT`` in the current
+    working directory.
+
+    Yields:
+        The list to which warnings are appended.
     """
     import mujoco
 
@@ -24,7 +25,7 @@ def quiet() -> Iterator[list[str]]:
     mujoco.set_mju_user_warning(lambda text: said.append(one_line(text)))
     try:
         with warnings.catch_warnings():
-            # Its compiler warns by way of Python.
+            # MuJoCo's compiler issues its warnings through Python's `warnings` module.
             warnings.simplefilter("always")
             warnings.showwarning = lambda message, *_: said.append(one_line(message))
             yield said
@@ -33,7 +34,7 @@ def quiet() -> Iterator[list[str]]:
 
 
 def one_line(message: object) -> str:
-    """What MuJoCo says, in one line: ``what; Element 'joint', line 6``."""
+    """Format a message of MuJoCo as one line: ``message; Element 'joint', line 6``."""
     lines = [line.strip().rstrip(".") for line in str(message).splitlines()]
     said = "; ".join(line for line in lines if line)
     return re.sub(r"^((XML )?(Error|Warning): )+", "", said)

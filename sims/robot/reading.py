@@ -1,4 +1,4 @@
-"""Model files read: an MJCF or a URDF becomes a `Robot`, mended where that is safe and noted."""
+"""Read an MJCF or URDF model file into a `Robot`, with safe repairs that are listed in notes."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from sims.robot.words import listed
 from sims.robot.xmlfile import Files, include, tree, written
 
 FORMATS: Mapping[str, Format] = {"mujoco": "mjcf", "robot": "urdf"}
-"""By the root element."""
+"""Formats of model files, by the name of the root element."""
 UNDRIVEN = "no actuators: nothing drives it unless a recording's [actuators.NAME] adds some"
 NUMBERS = (
     "body_mass", "body_inertia", "body_pos", "body_ipos", "jnt_pos", "jnt_axis",
     "jnt_stiffness", "dof_damping", "dof_armature", "dof_frictionloss",
 )  # fmt: skip
-"""Fields of the compiled model that may hold whatever the file says."""
+"""Fields of the compiled model that are checked for values beyond the allowed range."""
 
 
 def read(
@@ -37,18 +37,18 @@ def read(
     actuators: Mapping[str, Any] | None = None,
     engine: Mapping[str, Any] | None = None,
 ) -> Robot:
-    """The robot of a model file; nothing is printed and nothing is written.
+    """Read the robot of a model file, without printing or writing anything.
 
     Args:
-        path: of an MJCF or a URDF, told apart by what is in it.
-        actuators: by name, tables as in a recording's ``[actuators.NAME]``; they are added.
-        engine: ``timestep`` (s) and ``integrator``, in place of what the file states.
+        path: path of an MJCF or a URDF; the content determines the format.
+        actuators: actuators to add, by name: tables as in a recording's ``[actuators.NAME]``.
+        engine: ``timestep`` (s) and ``integrator`` that replace those of the file.
 
     Returns:
-        The robot, with a note for all that was mended or left out.
+        The robot, with a note for everything that was repaired or omitted.
 
     Raises:
-        InputError: it cannot be read, or MuJoCo refuses what it says; one line with file and cause.
+        InputError: the file cannot be read, or MuJoCo rejects it; one line with file and cause.
     """
     path = Path(path)
     files = Files(path)
@@ -109,7 +109,8 @@ def _robot(
         engine_table=engine,
         speeds=urdf.speeds(root) if kind == "urdf" else {},
     )
-    robot.__dict__["compiled"] = model  # which it would compile anew
+    # The model is stored here, so that it is not compiled again.
+    robot.__dict__["compiled"] = model
     if model.nmesh:
         release_free_memory()
     return robot
@@ -136,7 +137,7 @@ def _check(files: Files, model: Any) -> None:
 
 
 def _parsed(files: Files, root: Element) -> Any:
-    """The mujoco.MjSpec of the mended file."""
+    """Parse the repaired file into a mujoco.MjSpec."""
     import mujoco
 
     text, files.given = written(root)
@@ -149,7 +150,7 @@ def _parsed(files: Files, root: Element) -> Any:
 
 
 def _fused(parents: Mapping[str, str], compiled: set[str]) -> dict[str, str]:
-    """By body that MuJoCo fused into another, which that is."""
+    """Map the bodies that MuJoCo fused into others to the bodies that contain them."""
     aliases = {}
     for name in parents:
         into = name

@@ -1,12 +1,13 @@
-"""States of effects that go on beside a robot's motion, of all lanes at once.
+"""Integration of hidden states of effects along a robot's motion, for all batch elements at once.
 
-A state's rate r(w) is taken for linear in it over a step h, so that what is stiff is stepped
-exactly,
+The rate r(w) of a state is linearised in w over a step h, so that stiff states are integrated
+exactly:
 
     w(t + h) = w + h phi(h dr/dw) r(w),  phi(z) = (e^z - 1) / z                             (1)
 
 (the exponential Rosenbrock-Euler method: M. Hochbruck, A. Ostermann, Acta Numerica 19 (2010), eq.
-2.23), with the velocity in the middle of the step. What acts over a step is asked half of it later.
+2.23), with the velocity at the middle of the step. Forces over a step are evaluated half a step
+later.
 """
 
 from __future__ import annotations
@@ -18,11 +19,22 @@ from sims.robot.moment import RobotMoment
 from sims.system import Hidden, Moment, State
 
 NUDGE = 1e-6
-"""Of a state, by which its rate is differentiated."""
+"""Step of the state variable for the finite-difference derivative of its rate."""
 
 
 def advanced(effect: Hidden, c: Array, moment: Moment, state: State, step: float) -> State:
-    """Its state after so many seconds at this velocity."""
+    """Advance a hidden state by one exponential Rosenbrock-Euler step (1).
+
+    Args:
+        effect: effect with the hidden state.
+        c: (K, L, 1) coefficients of the effect.
+        moment: state of the system, constant over the step.
+        state: hidden state at the beginning of the step, (L, 1).
+        step: step length in seconds.
+
+    Returns:
+        The hidden state at the end of the step, (L, 1).
+    """
     _, rate = effect.act(c, moment, state)
     _, nudged = effect.act(c, moment, State(state.x, state.v + NUDGE))
     z = step * (nudged - rate) / NUDGE
@@ -33,13 +45,16 @@ def advanced(effect: Hidden, c: Array, moment: Moment, state: State, step: float
 
 
 def along(effect: Hidden, c: Array, moment: RobotMoment, step: float) -> State:
-    """Its states (S + 1, 1) at the beginnings of steps and at the end of a motion that is known.
+    """Integrate a hidden state along a known motion.
 
     Args:
-        effect: at its place.
-        c: (K, 1, 1) its coefficients.
-        moment: the middle of each step, (S,) lanes.
-        step: seconds.
+        effect: effect at its place.
+        c: (K, 1, 1) coefficients of the effect.
+        moment: system states at the middle of each of the S steps, stored as S batch elements.
+        step: step length in seconds.
+
+    Returns:
+        Hidden states (S + 1, 1): at the beginning of each step, and at the end of the motion.
     """
     steps = len(moment.x)
     state = effect.begin(c, moment.only(0))
@@ -59,7 +74,16 @@ def along(effect: Hidden, c: Array, moment: RobotMoment, step: float) -> State:
 
 
 def _linear(state: State, grown: Array, z: Array) -> State:
-    """The same of what is linear in its state all the way: of (1) h r(0) and h dr/dw, (S, 1)."""
+    """Integrate a hidden state whose rate is linear in the state throughout the motion.
+
+    Args:
+        state: initial state, (1, 1).
+        grown: (S, 1) h r(0) of each step, with r and h as in (1).
+        z: (S, 1) h dr/dw of each step.
+
+    Returns:
+        Hidden states (S + 1, 1).
+    """
     near = np.abs(z) < 1e-6
     added = grown * np.where(near, 1.0 + 0.5 * z, np.expm1(z) / np.where(near, 1.0, z))
     w = float(state.v[0, 0])

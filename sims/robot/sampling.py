@@ -1,12 +1,12 @@
-"""What a log shows of a channel whose values are known after every step.
+"""Recorded samples of a channel whose values are known after every simulation step.
 
 Between two steps of length h, with values a, b and slopes a', b' at their ends, a position at the
-share s of the step is
+fraction s of the step is
 
     y = (1 + 2s)(1 - s)^2 a + s(1 - s)^2 h a' + s^2 (3 - 2s) b - s^2 (1 - s) h b'               (1)
 
-the cubic through both (C. de Boor, A Practical Guide to Splines, 1978, chapter 4); a reading whose
-slope is not known is linear.
+the cubic Hermite interpolant (C. de Boor, A Practical Guide to Splines, 1978, chapter 4). A reading
+with unknown slope is interpolated linearly.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from sims.simulated import sensed
 from sims.system import Acting, Sensor, Signal
 
 EXACT = 1e-6
-"""Share of a step by which an instant may miss its end and be taken for it."""
+"""Tolerance, as a share of a step, within which a time counts as the end of a step."""
 
 
 def sampled(
@@ -33,15 +33,15 @@ def sampled(
     sensors: Acting,
     clock: float = 0.0,
 ) -> Array:
-    """Readings (L, T) at the instants `times` (T,) since the start.
+    """Compute the recorded readings (L, T) of a channel, including sensor effects.
 
     Args:
-        values: (L, S + 1) at the ends of steps, the beginning first.
-        slopes: their rates; None where they are not known.
-        step: seconds.
-        times: recorded stamps, seconds since the start.
+        values: (L, S + 1) values at the start and at the end of each step.
+        slopes: (L, S + 1) time derivatives of the values; None if unknown.
+        step: step length in seconds.
+        times: (T,) recorded time stamps in seconds since the start.
         sensors: effects on this channel in the order in which a signal passes them.
-        clock: the first stamp, seconds.
+        clock: first recorded time stamp in seconds.
     """
     lanes, count = values.shape
     ends = step * np.arange(count)
@@ -56,14 +56,22 @@ def sampled(
         grid = np.broadcast_to(ends, (some.size, count))
         steps = np.diff(grid, axis=1, prepend=0.0)
         filtered = sensed(filters, values[some], steps, grid, clock)
-        # What a filter shows has a slope that nobody knows.
+        # The slope of a filtered signal is unknown.
         result[some] = _at(filtered, None, step, instants[some])
     return read(result, times, sensors, clock)
 
 
 def read(readings: Array, times: Array, sensors: Acting, clock: float = 0.0) -> Array:
-    """What sensors make of readings (L, T), which are changed, where they neither filter nor show
-    another instant; the rest as for `sampled`.
+    """Apply sensor effects that act on each sample alone, without filters and time shifts.
+
+    Args:
+        readings: (L, T) readings; changed in place.
+        times: (T,) recorded time stamps in seconds since the start.
+        sensors: effects on this channel in the order in which a signal passes them.
+        clock: first recorded time stamp in seconds.
+
+    Returns:
+        The changed readings (L, T).
     """
     result = readings
     stamps = np.broadcast_to(times, result.shape)
@@ -78,7 +86,16 @@ def read(readings: Array, times: Array, sensors: Acting, clock: float = 0.0) -> 
 
 
 def places(step: float, times: Array, count: int) -> NDArray[np.intp] | None:
-    """(T,) which of the `count` ends of steps instants are; None where some lie between."""
+    """Find the steps at whose ends the samples are taken.
+
+    Args:
+        step: step length in seconds.
+        times: (T,) sample times in seconds since the start.
+        count: number of step ends, including the start.
+
+    Returns:
+        (T,) indices of the step ends; None if any sample is between two of them.
+    """
     place = np.clip(times / step, 0.0, count - 1.0)
     nearest = np.rint(place)
     near = bool((np.abs(place - nearest) < EXACT).all())
@@ -86,13 +103,13 @@ def places(step: float, times: Array, count: int) -> NDArray[np.intp] | None:
 
 
 def keeps_time(sensors: Acting) -> bool:
-    """Whether what they show hangs on no other instant."""
+    """Return whether the readings depend on the value at the sample time alone."""
     shown = [e for e, _ in sensors if isinstance(e, Sensor)]
     return all(type(e).times is Sensor.times and not e.filters for e in shown)
 
 
 def _filtering(sensors: Acting) -> Iterator[tuple[NDArray[np.intp], Acting]]:
-    """The lanes in which a filter acts, with the filters there; none where there is none."""
+    """Yield the batch elements with an active filter, and the filters there, if any."""
     filters = tuple((e, c) for e, c in sensors if isinstance(e, Sensor) and e.filters)
     on = [acts(c)[:, 0] for _, c in filters]
     lanes = np.flatnonzero(np.any(on, axis=0)) if filters else np.empty(0, dtype=np.intp)
@@ -101,14 +118,15 @@ def _filtering(sensors: Acting) -> Iterator[tuple[NDArray[np.intp], Acting]]:
 
 
 def _at(values: Array, slopes: Array | None, step: float, instants: Array) -> Array:
-    """Values (L, T) at instants (L, T)."""
+    """Interpolate values (L, S + 1) at times (L, T)."""
     place = instants / step
     nearest = np.rint(place)
     near = np.abs(place - nearest) < EXACT
     if near.all():
         chosen: Array = np.take_along_axis(values, nearest.astype(np.intp), axis=1)
         return chosen
-    # What is at the end of a step shows it to the bit, whatever instants other lanes ask for.
+    # A sample at the end of a step returns the stored value bit for bit, whatever times other batch
+    # elements use.
     place = np.where(near, nearest, place)
     last = values.shape[1] - 2
     below = np.clip(np.floor(place), 0, max(last, 0)).astype(np.intp)

@@ -1,6 +1,4 @@
-"""How large forces and inertias are along the joints of a robot, so that ranges of coefficients
-suit a finger as they suit a shoulder.
-"""
+"""Typical forces and inertias of each joint, which set the ranges of effect coefficients."""
 
 from __future__ import annotations
 
@@ -14,29 +12,37 @@ from sims.robot.inertia_matrix import inertia_matrix
 from sims.robot.model import Robot
 
 POSES = 24
-"""Poses that are looked at."""
+"""Number of random poses that are evaluated."""
 FREE = 1.5
-"""Radians or metres to either side of the first pose, of a joint without limits."""
+"""Half the position range assumed for a joint without limits, in rad or m."""
 ACCELERATION = 5.0
-"""rad/s^2 or m/s^2 that a joint of its inertia is taken to reach."""
+"""Typical acceleration of a joint, in rad/s^2 or m/s^2."""
 LEAST = 1e-4
-"""N or N m; no joint is taken to carry less."""
+"""Minimum typical force of a joint, in N or N m."""
 NEIGHBOUR = 0.01
-"""Ranges of coefficients suit a joint of at least this share of the force and inertia of the joint
-that carries it: a smaller value is more likely a missing inertia of the file than a light link.
+"""Minimum ratio of a joint's typical force and inertia to those of its parent joint.
+
+It applies to the ranges of coefficients. A smaller value more likely means that the file omits an
+inertia than that the link is light.
 """
 
 
 class Scales(NamedTuple):
-    """Of each joint (D,): a typical force in N or N m, and the mean inertia in kg or kg m^2."""
+    """Typical forces and inertias of the D joints with one coordinate.
+
+    Attributes:
+        force: (D,) typical force in N or N m.
+        inertia: (D,) mean inertia in kg or kg m^2.
+    """
 
     force: Array
     inertia: Array
 
 
 def scales(robot: Robot) -> Scales:
-    """Over poses all through the joints' ranges: what gravity pulls with, and what it takes to
-    accelerate.
+    """Compute typical forces and inertias over random poses within the joints' ranges.
+
+    The force is the larger of the largest gravity force and the force for a typical acceleration.
     """
     import mujoco
 
@@ -64,11 +70,11 @@ def scales(robot: Robot) -> Scales:
 
 
 def coefficient_scales(robot: Robot) -> Scales:
-    """Return force and inertia of each joint (D,) that the ranges of coefficients follow.
+    """Compute the forces and inertias of each joint (D,) that set the ranges of coefficients.
 
-    They are those of `scales`, where a joint counts for at least `NEIGHBOUR` times the joint of the
-    same kind that carries it, so that a link whose inertia the file leaves out (1e-9 kg m^2) does
-    not make the ranges of its joint vanish.
+    The values are those of `scales`, but at least `NEIGHBOUR` times the values of the parent joint
+    of the same kind. So a link whose inertia the file omits (1e-9 kg m^2) does not make the ranges
+    of its joint vanish.
     """
     own = scales(robot)
     force, inertia = own.force.copy(), own.inertia.copy()
@@ -90,7 +96,14 @@ def coefficient_scales(robot: Robot) -> Scales:
 
 
 def floating_forces(robot: Robot) -> Array:
-    """(F,) of each move of what floats, what it takes to accelerate, in N or N m."""
+    """Compute the typical force of each degree of freedom of floating bodies, in N or N m.
+
+    Args:
+        robot: robot with floating bodies.
+
+    Returns:
+        (F,) forces for the acceleration `ACCELERATION`.
+    """
     inertias = np.diagonal(inertia_matrix(robot.compiled))
     result: Array = ACCELERATION * inertias[Floating.of(robot).velocities]
     return result

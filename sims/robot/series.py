@@ -1,28 +1,28 @@
-"""A joint that yields or has play: a second joint in series with it, in the same body.
+"""Flexible joints and joints with backlash, as a second joint in series in the same body.
 
-With x the joint's position on the side of its drive, where actuator, encoder, stated damping and
-dry friction are, y that of the links that it carries, J the drive's inertia (the armature) and T
-what passes between them,
+Let x be the joint's position on the side of its drive, where the actuator, encoder, specified
+damping and dry friction are, y the position of the links that it carries, J the drive's inertia
+(the armature) and T the transmitted force:
 
     J x'' = U - T                                                          (1)
     (M(q) q'' + n(q, q'))_j = T,  q_j = y                                  (2)
 
-(M. W. Spong, J. Dyn. Syst. Meas. Control 109(4), 310 (1987), doi:10.1115/1.3143860). A second
-joint d = y - x about the same axis makes the body's position y, and
+(M. W. Spong, J. Dyn. Syst. Meas. Control 109(4), 310 (1987), doi:10.1115/1.3143860). A second joint
+d = y - x about the same axis makes y the body's position, and
 
-    T = -k d - c d'         of a spring with a damper                      (3)
-    |d| <= gap / 2          of flanks, which MuJoCo's limit holds          (4)
-    T = -k e - c d'         of both: flanks that give, e what d exceeds    (5)
+    T = -k d - c d'         for a spring with a damper                     (3)
+    |d| <= gap / 2          for rigid flanks, by MuJoCo's joint limit      (4)
+    T = -k e - c d'         for compliant flanks; e is d beyond the gap    (5)
 
-with shares of inertia and damping counted by M_jj in the pose that the file states (q = 0 where it
-states none), so MuJoCo integrates it as it does any joint, and a model file can say it. Of (5), T
-pushes only, and is nothing between the flanks. A limit of MuJoCo with impedance s exerts
+The shares of inertia and damping refer to M_jj in the pose that the file specifies (q = 0 by
+default). So MuJoCo integrates the second joint like any other, and a model file can state it. In
+(5), T only pushes, and is zero between the flanks. A limit of MuJoCo with impedance s exerts
 
     -(K e + C d') / (A + R), R = (1 - s) A0 / s                            (6)
 
-for `solref` (-K s, -C s), A being the inverse inertia along d and A0 that of the pose of the file
-(MuJoCo's documentation, "Computation", constraint model): at the least s, 1e-4, a spring of K s /
-A0 with an error of the size of s.
+for `solref` (-K s, -C s), with the inverse inertia A along d, and its value A0 in the pose of the
+file (MuJoCo's documentation, "Computation", constraint model). At the smallest s, 1e-4, this is a
+spring of stiffness K s / A0 with a relative error of the order of s.
 """
 
 from __future__ import annotations
@@ -46,41 +46,54 @@ from sims.robot.simulation_model import strip_shapes
 from sims.system import Acting, Effect, Element, Hidden
 
 LIGHTEST = 0.01
-"""Share of the joint's inertia that a drive has at least: without any, nothing holds x."""
+"""Minimum inertia of a drive, as a share of the joint's inertia.
+
+Without inertia of the drive, x in (1) is undetermined.
+"""
 SLIGHT = 1e-4
-"""The same while a model is compiled."""
+"""Minimum inertia of a drive while a model is compiled, as a share of the joint's inertia."""
 RESOLVED, RESOLVED_BY_RK4 = 1.2, 2.0
-"""Radians of the swing of drive and links against each other in a step, at most."""
+"""Maximum phase, in radians per step, of the oscillation between drive and links.
+
+The second value applies to the Runge-Kutta 4 integrator, the first one to all others.
+"""
 HARD = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""`solimp` of flanks: as hard as MuJoCo allows."""
+"""Parameter `solimp` of rigid flanks: the hardest value that MuJoCo allows."""
 GIVING = (1e-4, 1e-4, 0.001, 0.5, 2.0)
-"""The same of flanks that give as a spring does: as soft as MuJoCo allows, see (6)."""
+"""Parameter `solimp` of compliant flanks: the softest value that MuJoCo allows, see (6)."""
 UNLOADED = 1e-3
-"""Share of a typical force below which a load leaves the links between the flanks."""
+"""Load, as a multiple of the inertia, below which the links rest between the flanks."""
 WRITTEN = ("dof_armature", "jnt_stiffness", "dof_damping", "jnt_range", "jnt_solref", "jnt_solimp")
-"""Fields of the model that are written for it."""
+"""Model fields that are written for joints in series."""
 FIELDS = (*WRITTEN, "dof_invweight0")
-"""The same, and what MuJoCo derives that is read for it."""
+"""Model fields that are written for joints in series, and those derived by MuJoCo that are read."""
 
 Flags = NDArray[np.bool_]
 
 Added = tuple[tuple[str, str], ...]
-"""Joints, and the name of an effect that each has in series; a joint may have several."""
+"""Effects in series with joints, as pairs of joint and effect name; a joint may have several."""
 
 
 def name_of(joint: str, effects: Collection[str]) -> str:
-    """What the second joint is called: ``elbow_flexibility``, ``elbow_transmission`` of several."""
+    """Make the name of a second joint, such as ``elbow_flexibility``.
+
+    It is ``elbow_transmission`` for several effects.
+
+    Args:
+        joint: name of the joint with which it is in series.
+        effects: names of the effects that it combines.
+    """
     kind = next(iter(effects)).rpartition(".")[2] if len(effects) == 1 else "transmission"
     return f"{joint}_{kind}"
 
 
 def second_of(robot: Robot, joint: str) -> str:
-    """The name of the one that is in series with a joint; empty where none is."""
+    """Return the name of the joint in series with a joint; empty if there is none."""
     return next((name for name in robot.series if name.rpartition("_")[0] == joint), "")
 
 
 def by_joint(added: Added) -> dict[str, list[str]]:
-    """The effects in series with each joint."""
+    """Group the effects in series by joint."""
     effects: dict[str, list[str]] = {}
     for joint, effect in added:
         effects.setdefault(joint, []).append(effect)
@@ -88,7 +101,12 @@ def by_joint(added: Added) -> dict[str, list[str]]:
 
 
 def by_series(acting: Acting, count: int) -> dict[Added, list[int]]:
-    """Lanes by what acts in series with joints in them."""
+    """Group batch elements by their effects in series with joints.
+
+    Args:
+        acting: effects with their coefficients (K, L, 1).
+        count: number L of batch elements.
+    """
     lanes: dict[Added, list[int]] = {}
     there = [(e, (c[0] > 0)[:, 0]) for e, c in acting if is_series(e)]
     coupled = np.zeros(count, dtype=bool)
@@ -104,12 +122,12 @@ def by_series(acting: Acting, count: int) -> dict[Added, list[int]]:
 
 
 def in_series(robot: Robot, added: Added) -> Robot:
-    """The robot with more joints; elements keep the names that the robot has for them.
+    """Add joints in series to a robot, without changing element names.
 
     Args:
-        robot: that was read.
-        added: joints, each the last one of its body, and the effect that each has in series; and
-            whether drives are coupled.
+        robot: robot as read from its model file.
+        added: joints, each the last one of its body, with the effect in series; `ANY` requests the
+            tendons of coupled drives.
     """
     import mujoco
 
@@ -123,7 +141,7 @@ def in_series(robot: Robot, added: Added) -> Robot:
     inertias = _inertias(robot)
     for name, effects in by_joint(added).items():
         first = joints[robot.joint(name).id]
-        # Whatever the file's defaults say is said of the first joint alone.
+        # Default classes of the file apply to the first joint only.
         nothing = {"damping": 0.0, "frictionloss": 0.0, "armature": 0.0, "stiffness": 0.0}
         second = first.parent.add_joint(
             name=name_of(name, effects), type=first.type, axis=first.axis, pos=first.pos
@@ -137,9 +155,9 @@ def in_series(robot: Robot, added: Added) -> Robot:
         second.limited = limited.mjLIMITED_TRUE if play else limited.mjLIMITED_FALSE
         if play:
             second.range = (-1.0, 1.0)
-        # Lanes have more; here it only has to compile.
+        # The simulation writes the actual armature; this minimum makes the model compile.
         first.armature = max(first.armature, SLIGHT * inertias[name])
-    # Poses that are kept lack the new coordinates.
+    # Keyframes lack the new coordinates.
     for key in list(spec.keys):
         spec.delete(key)
     series = {name_of(name, own): inertias[name] for name, own in by_joint(added).items()}
@@ -148,15 +166,15 @@ def in_series(robot: Robot, added: Added) -> Robot:
 
 @kept_with_robot
 def compile_error(robot: Robot, added: Added) -> str:
-    """Say why the model with more joints does not compile; empty where it does.
+    """Return why the model with joints in series does not compile; empty if it does.
 
     Args:
-        robot: that was read.
-        added: as for `in_series`.
+        robot: robot as read from its model file.
+        added: effects in series, as for `in_series`.
     """
     try:
         in_series(strip_shapes(robot), added).compiled  # noqa: B018
-    # MuJoCo has errors of several kinds, and an effect of a user's plugin may raise any.
+    # MuJoCo raises several kinds of errors, and an effect of a user's plugin may raise any.
     except Exception as error:
         return one_line(error) or type(error).__name__
     return ""
@@ -164,25 +182,26 @@ def compile_error(robot: Robot, added: Added) -> str:
 
 @kept_with_robot
 def _inertias(robot: Robot) -> dict[str, float]:
-    """About each joint, in the pose that the file states."""
+    """Return the inertia about each joint, in the pose that the file specifies."""
     inertias = np.diagonal(inertia_matrix(robot.compiled)).tolist()
     return {j.name: inertias[j.velocity] for j in robot.joints if j.single}
 
 
 def is_series(effect: Effect | type[Effect]) -> bool:
-    """Whether it is an element in series with a joint."""
+    """Return whether an effect is an element in series with a joint."""
     kind = effect if isinstance(effect, type) else type(effect)
     return issubclass(kind, Hidden) and bool(kind.between)
 
 
 def write(fields: Mapping[str, Any], robot: Robot, acting: Acting) -> None:
-    """Write effects in series with joints into the fields of lanes; `press` follows once MuJoCo has
-    derived what it does.
+    """Write effects in series with joints into the model fields of a batch.
+
+    `press` must be called after MuJoCo has derived its constants.
 
     Args:
-        fields: of the lanes' models.
-        robot: of `in_series`.
-        acting: effects with coefficients (K, L, 1), of which others are left alone.
+        fields: model fields of the batch elements.
+        robot: robot of `in_series`.
+        acting: effects with coefficients (K, L, 1); other effects are ignored.
     """
     made: dict[str, list[Element]] = {}
     for effect, c in acting:
@@ -195,7 +214,12 @@ def write(fields: Mapping[str, Any], robot: Robot, acting: Acting) -> None:
 
 
 def element(kind: type[Effect], numbers: Mapping[str, Array]) -> Element:
-    """The element that an effect is by its coefficients (L,); those that a place lacks are zero."""
+    """Make the series element of an effect from its coefficients (L,).
+
+    Args:
+        kind: class of the effect.
+        numbers: coefficients by name; missing ones are zero.
+    """
     assert issubclass(kind, Hidden)
     first = next(iter(numbers.values()))
     values = [numbers.get(one.name, np.zeros_like(first)) for one in kind.between]
@@ -203,19 +227,19 @@ def element(kind: type[Effect], numbers: Mapping[str, Array]) -> Element:
 
 
 def together(elements: Sequence[Element]) -> Element:
-    """What lies between one drive and its links as one element: gap first, then the spring."""
+    """Combine several elements in series with one joint by adding their numbers."""
     names = ("stiffness", "damping", "gap", "drive")
     return Element(*(np.sum([getattr(e, name) for e in elements], axis=0) for name in names))
 
 
 def state(fields: Mapping[str, Any], robot: Robot, place: str, made: Element) -> None:
-    """Write elements (L,) into fields of models.
+    """Write elements in series (L,) into model fields.
 
     Args:
-        fields: of the models.
-        robot: of `in_series`.
-        place: the joint with which they are in series.
-        made: they.
+        fields: model fields of the batch elements.
+        robot: robot of `in_series`.
+        place: joint with which they are in series.
+        made: the elements.
     """
     second = robot.joint(second_of(robot, place))
     inertia = robot.series[second.name]
@@ -239,13 +263,16 @@ def state(fields: Mapping[str, Any], robot: Robot, place: str, made: Element) ->
 
 
 def gives(made: Element) -> Flags:
-    """(L,) whether it is flanks that give as a spring does."""
+    """Return whether elements (L,) are compliant flanks: a gap with a spring."""
     return (made.gap > 0) & (made.stiffness > 0)
 
 
 def press(fields: Mapping[str, Any], robot: Robot) -> None:
-    """Turn stiffness and damping of flanks that give into what MuJoCo's limit takes for them; see
-    (6).
+    """Convert stiffness and damping of compliant flanks to parameters of MuJoCo's limit by (6).
+
+    Args:
+        fields: model fields of the batch elements.
+        robot: robot of `in_series`.
     """
     for name in robot.series:
         second = robot.joint(name)
@@ -255,17 +282,17 @@ def press(fields: Mapping[str, Any], robot: Robot) -> None:
 
 
 def _hard(step: float) -> tuple[float, float]:
-    """`solref` of flanks: as stiff as a step bears."""
+    """Return `solref` of rigid flanks: the stiffest value that is stable for a time step."""
     return 2.0 * step, 1.0
 
 
 def with_flanks(robot: Robot, made: Mapping[str, Element], model: Any = None) -> Robot:
-    """The robot of `in_series` whose file is to state flanks.
+    """Set the joint limits that represent flanks, for writing a model file.
 
     Args:
-        robot: of `in_series`.
-        made: elements of one lane, by the joint with which they are in series.
-        model: that is compiled of it, with all that acts; those that give are told by it.
+        robot: robot of `in_series`.
+        made: elements of one batch element, by the joint with which they are in series.
+        model: model compiled from the robot with all effects; required for compliant flanks.
     """
     spec, option = robot.spec.copy(), (model or robot.compiled).opt
     joints = {joint.name: joint for joint in spec.joints}
@@ -291,8 +318,14 @@ def with_flanks(robot: Robot, made: Mapping[str, Element], model: Any = None) ->
 def _stepped(
     made: Element, inertia: float, drive: Array, step: float, explicit: bool
 ) -> tuple[Array, Array]:
-    """Stiffness and damping (L,) as a step bears them: it would let a swing that it does not
-    resolve explode.
+    """Limit stiffness and damping (L,) to values that are stable for a time step.
+
+    Args:
+        made: elements in series.
+        inertia: inertia of the joint.
+        drive: (L,) inertia of the drive.
+        step: time step in seconds.
+        explicit: whether the integrator treats damping explicitly (Runge-Kutta 4).
     """
     softened = 1.0 / drive + 1.0 / inertia
     most = ((RESOLVED_BY_RK4 if explicit else RESOLVED) / step) ** 2 / softened
@@ -301,19 +334,19 @@ def _stepped(
     borne = np.minimum(damping, RESOLVED / step / softened)
     if explicit:
         return stiffness, borne
-    # Where dampings are implicit so is a stiffness, by the backward rule: k (d + h d').
+    # If damping is implicit, so is this stiffness, by the backward Euler rule: k (d + h d').
     give = gives(made)
     backward = damping + step * (made.stiffness - stiffness)
     return np.where(give, stiffness, made.stiffness), np.where(give, borne, backward)
 
 
 def hung(fields: Mapping[str, Any], robot: Robot, loads: Sequence[Array]) -> list[Array]:
-    """(n,) of each joint in series where it rests while its drive is held.
+    """Compute the rest positions (n,) of joints in series while their drives are held.
 
     Args:
-        fields: of the lanes' models.
-        robot: of `in_series`.
-        loads: (n,) what pulls at each of them.
+        fields: model fields of the batch elements.
+        robot: robot of `in_series`.
+        loads: (n,) load at each of these joints.
     """
     places = []
     for (name, inertia), load in zip(robot.series.items(), loads, strict=True):

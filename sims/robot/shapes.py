@@ -1,4 +1,4 @@
-"""Shapes of a model whose mesh cannot be had are left out, unless a mass follows from them."""
+"""Omit shapes whose mesh is missing, unless the mass of a moving body depends on them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from sims.robot.words import listed
 
 @dataclass
 class Left:
-    """What was left out of a spec.
+    """Shapes and textures that were omitted from a spec.
 
     Attributes:
-        source: what messages begin with.
-        touching: by the reason, files or names of shapes that would have touched others.
-        seen: likewise those that are only seen.
+        source: beginning of error messages.
+        touching: files or names of omitted shapes that could have touched others, by reason.
+        seen: files or names of omitted elements that are only visual, by reason.
     """
 
     source: str
@@ -27,10 +27,16 @@ class Left:
     seen: dict[str, list[str]] = field(default_factory=dict)
 
     def leave_out(self, spec: Any, geom: Any, label: str, why: str) -> None:
-        """Take a geom out of a spec.
+        """Remove a geom from a spec and record it.
+
+        Args:
+            spec: the mujoco.MjSpec.
+            geom: geom to remove.
+            label: file or name of the shape, for messages.
+            why: reason.
 
         Raises:
-            InputError: the mass of a body that moves would follow from it.
+            InputError: the mass of a moving body depends on the geom.
         """
         body = geom.parent
         if weighs(spec, geom, body):
@@ -44,7 +50,7 @@ class Left:
 
     @property
     def notes(self) -> list[str]:
-        """One line for each reason."""
+        """Notes, one for each reason."""
         notes = [
             f"shapes left out, and their contacts, since their file {why}: {listed(labels)}"
             for why, labels in self.touching.items()
@@ -55,7 +61,13 @@ class Left:
 
 
 def weighs(spec: Any, geom: Any, body: Any) -> bool:
-    """Whether the mass of a body that moves would follow from a geom."""
+    """Return whether the mass of a moving body is computed from a geom.
+
+    Args:
+        spec: the mujoco.MjSpec.
+        geom: geom of the body.
+        body: body of the spec.
+    """
     import mujoco
 
     low, high = spec.compiler.inertiagrouprange
@@ -69,7 +81,7 @@ def weighs(spec: Any, geom: Any, body: Any) -> bool:
 
 
 def moves(body: Any) -> bool:
-    """Whether joints move a body of a spec, its own or those of what carries it."""
+    """Return whether a body of a spec moves, by its own joints or those of its ancestors."""
     while body is not None and body.name != "world":
         if body.joints:
             return True
@@ -78,7 +90,17 @@ def moves(body: Any) -> bool:
 
 
 def without_mesh(spec: Any, name: str, why: str, left: Left) -> bool:
-    """Leave out a mesh that MuJoCo refuses, and the shapes that have it."""
+    """Remove a mesh that MuJoCo rejects, and the geoms that use it.
+
+    Args:
+        spec: the mujoco.MjSpec.
+        name: name of the mesh.
+        why: reason.
+        left: record of omitted shapes.
+
+    Returns:
+        Whether the spec contains this mesh.
+    """
     meshes = [mesh for mesh in spec.meshes if mesh.name == name]
     for geom in [geom for geom in spec.geoms if geom.meshname == name]:
         left.leave_out(spec, geom, name, why)
@@ -88,7 +110,17 @@ def without_mesh(spec: Any, name: str, why: str, left: Left) -> bool:
 
 
 def without_picture(spec: Any, name: str, why: str, left: Left) -> bool:
-    """Put one colour in the place of a picture that MuJoCo refuses."""
+    """Replace a texture that MuJoCo rejects by a single colour.
+
+    Args:
+        spec: the mujoco.MjSpec.
+        name: name of the texture.
+        why: reason.
+        left: record of omitted shapes.
+
+    Returns:
+        Whether the spec contains this texture.
+    """
     import mujoco
 
     for texture in [texture for texture in spec.textures if texture.name == name]:

@@ -1,8 +1,8 @@
-"""The model that is simulated: a robot's model without what does not move it.
+"""The model that is simulated: a robot's model without elements that do not influence its motion.
 
-Lanes of a simulation copy the whole model, for every candidate that adds joints to it. Meshes,
-textures and geoms that nothing can touch take most of the memory and of the compiler's time, and
-move nothing once the masses that follow from them are known.
+The batch elements of a simulation copy the whole model, for every candidate that adds joints to it.
+Meshes, textures and geoms that cannot collide take most of the memory and of the compile time. They
+do not influence the motion once the masses that follow from them are known.
 """
 
 from __future__ import annotations
@@ -33,41 +33,42 @@ RAYS = frozenset(
     f"mjSENS_{name}"
     for name in ("RANGEFINDER", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "TACTILE", "PLUGIN")
 )
-"""Sensors that measure shapes that need not collide."""
+"""Sensor types that measure shapes which need not collide."""
 SHAPES = (
     "geom_", "mesh_", "mat_", "tex_", "skin_", "hfield_", "bvh_", "oct_", "vis", "stat",
     "dof_length", "body_margin",
 )  # fmt: skip
-"""Beginnings of the model's fields that do not matter to its motion: shapes, of which those that
-collide are compared by `GEOM_FIELDS`, lengths that decide which bodies sleep, and margins that
-bound the search for contacts.
+"""Prefixes of model fields that do not influence the motion.
+
+They are shapes (colliding ones are compared by `GEOM_FIELDS`), lengths that decide which bodies
+sleep, and margins that bound the search for contacts.
 """
 GEOM_FIELDS = (
     "geom_type", "geom_bodyid", "geom_condim", "geom_priority", "geom_sameframe", "geom_solmix",
     "geom_solref", "geom_solimp", "geom_size", "geom_aabb", "geom_rbound", "geom_pos", "geom_quat",
     "geom_friction", "geom_margin", "geom_gap", "geom_fluid",
 )  # fmt: skip
-"""What contacts of a geom depend on, in addition to its mesh and to what it may touch."""
+"""Fields on which contacts of a geom depend, in addition to its mesh and its contact partners."""
 
 POSES = 20
 """Number of poses in which contacts of whole meshes and of their hulls are compared."""
 FREE_RANGE = (-1.0, 1.0)
-"""Positions of joints without a range in these poses, rad or m."""
+"""Positions of joints without a range in these poses, in rad or m."""
 
 
 @kept_with_robot
 def strip_assets(robot: Robot) -> Robot:
-    """Leave out of a robot's model what does not move it.
+    """Remove the elements of a robot's model that do not influence its motion.
 
-    Masses and inertias are those that the whole model has compiled to. Geoms that may touch others
-    stay, with the convex hulls of their meshes.
+    Masses and inertias are those of the whole compiled model. Geoms that can collide stay, with the
+    convex hulls of their meshes.
 
     Args:
-        robot: that was read.
+        robot: robot as read from its model file.
 
     Returns:
-        The robot with a smaller spec, which moves alike to the last bit; the robot itself where
-        that cannot be had.
+        The robot with a smaller spec, whose motion is bitwise equal; the robot itself if that is
+        impossible.
     """
     import mujoco
 
@@ -76,25 +77,25 @@ def strip_assets(robot: Robot) -> Robot:
         return robot
     try:
         stripped = _stripped(robot)
-    # Whatever MuJoCo's compiler says of the smaller model: the whole one has compiled.
+    # Any compiler error concerns the smaller model only, since the whole model has compiled.
     except (ValueError, RuntimeError):
         stripped = robot
-    # MuJoCo keeps all meshes that it has read, for specs that may name them again.
+    # MuJoCo caches all meshes that it has read, for specs that may use them again.
     mujoco.mj_clearCache(mujoco.mj_getCache())
     release_free_memory()
     return stripped
 
 
 def _stripped(robot: Robot) -> Robot:
-    """Leave out of a robot's model what does not move it, see `strip_assets`.
+    """Remove the elements of a robot's model that do not influence its motion, see `strip_assets`.
 
     Raises:
-        ValueError: MuJoCo refuses the smaller model.
+        ValueError: MuJoCo rejects the smaller model.
     """
     model = robot.compiled
     spec = robot.spec.copy()
     with quiet():
-        spec.compile()  # which numbers its elements
+        spec.compile()  # Compilation assigns numbers to the elements.
     _state_inertials(spec, model)
     hulls, numbers = _reduce_geoms(spec, model)
     named(spec, robot)
@@ -118,14 +119,15 @@ def _stripped(robot: Robot) -> Robot:
 
 @kept_with_robot
 def strip_shapes(robot: Robot) -> Robot:
-    """Leave out of a robot's model all geoms that no other element names: it compiles in a
-    millisecond, or not at all as the whole one does.
+    """Remove all geoms that no other element refers to.
+
+    The resulting model compiles in a millisecond, or fails to compile like the whole model.
 
     Args:
-        robot: that was read.
+        robot: robot as read from its model file.
 
     Returns:
-        The robot without contacts; the robot itself where MuJoCo cannot do without shapes.
+        The robot without contacts; the robot itself if MuJoCo cannot compile it without shapes.
     """
     spec = strip_assets(robot).spec.copy()
     for geom in spec.geoms:
@@ -139,7 +141,7 @@ def strip_shapes(robot: Robot) -> Robot:
 
 
 def _needs_shapes(model: Any) -> bool:
-    """Whether more than contacts depends on geoms, or contacts on more than hulls."""
+    """Return whether non-contact quantities depend on geoms, or contacts on more than hulls."""
     import mujoco
 
     kinds = {mujoco.mjtSensor(int(kind)).name for kind in model.sensor_type}
@@ -150,7 +152,7 @@ def _needs_shapes(model: Any) -> bool:
 
 
 def _state_inertials(spec: Any, model: Any) -> None:
-    """State the masses and inertias that the model has, whatever they follow from."""
+    """Write the masses and inertias of the compiled model into a spec."""
     import mujoco
 
     for compiler in (spec.compiler, *(body.compiler for body in spec.bodies)):
@@ -170,7 +172,7 @@ def _state_inertials(spec: Any, model: Any) -> None:
 
 
 def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int]]:
-    """Let geoms that cannot touch anything count as visual ones, and the others have convex hulls.
+    """Make geoms that cannot collide visual, and reduce the meshes of the others to convex hulls.
 
     Returns:
         The hulls by the names of their meshes, and the numbers of all geoms by their names.
@@ -181,7 +183,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
     known = mujoco.__version__.startswith(TESTED)
     hulls: dict[str, Hull] = {}
     numbers: dict[str, int] = {}
-    # A spec forgets these numbers when it is edited.
+    # The numbers are collected first, since a spec loses them when it is edited.
     for geom, i in [(geom, geom.id) for geom in spec.geoms]:
         geom.name = geom.name or f"simgap.geom{i}"
         numbers[geom.name] = i
@@ -190,7 +192,7 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
         mesh = int(model.geom_dataid[i]) if geom.meshname else -1
         if mesh < 0 and not geom.meshname:
             continue
-        # What the compiler has made of the mesh: a primitive that it is fitted to, or a frame.
+        # The compiler may have fitted a primitive to the mesh, or moved its frame.
         kind = mujoco.mjtGeom(int(model.geom_type[i]))
         if kind != mujoco.mjtGeom.mjGEOM_MESH:
             geom.type, geom.size, geom.meshname = kind, model.geom_size[i], ""
@@ -212,12 +214,12 @@ def _reduce_geoms(spec: Any, model: Any) -> tuple[dict[str, Hull], dict[str, int
 
 
 def _moves_alike(model: Any, other: Any, numbers: Mapping[str, int]) -> bool:
-    """Whether two models of one robot have equal numbers, but for shapes that touch nothing.
+    """Return whether two models of one robot have equal fields, except for non-colliding shapes.
 
     Args:
-        model: of the whole.
-        other: with some of its geoms.
-        numbers: of the whole model's geoms, by the names that these have.
+        model: whole model.
+        other: model with some of its geoms.
+        numbers: numbers of the whole model's geoms, by geom name.
     """
     of = [numbers[other.geom(i).name] for i in range(other.ngeom)]
     fields = {
@@ -235,13 +237,14 @@ def _moves_alike(model: Any, other: Any, numbers: Mapping[str, int]) -> bool:
 
 
 def _touches_alike(robot: Robot, other: Any, numbers: Mapping[str, int]) -> bool:
-    """Whether contacts are equal in poses drawn from the ranges of the joints: what MuJoCo reads of
-    a mesh may be more in another version than hulls hold.
+    """Return whether contacts are equal in random poses within the ranges of the joints.
+
+    The test is needed since other versions of MuJoCo may read more of a mesh than hulls contain.
 
     Args:
-        robot: the whole.
-        other: the model with hulls.
-        numbers: as in `_moves_alike`.
+        robot: robot with the whole model.
+        other: model with hulls.
+        numbers: numbers of the whole model's geoms, by geom name.
     """
     import mujoco
 

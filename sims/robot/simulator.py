@@ -1,8 +1,9 @@
-"""A robot's model file as a simulator that any tuner tunes and explain explains.
+"""Simulator of a robot's model file, for tuners and for explain.
 
-MuJoCo steps at the model's own time step and with its own integrator. Samples of a log lie where
-they lie: between two steps a position is the cubic through both ends with both velocities, other
-readings are linear. What an actuator is given over a step is the mean of its command over the step.
+MuJoCo uses the time step and the integrator of the model file. Samples of a log may be at any time:
+between two steps, positions are interpolated by the cubic with the positions and velocities of both
+ends, and other readings linearly. The control of an actuator over a step is the mean of its command
+over the step.
 """
 
 from __future__ import annotations
@@ -49,15 +50,16 @@ from sims.system import Acting, Effect, Engine, Sensor
 from sims.user_toml import shown
 
 WIDTH = 128
-"""Instants of a motion that are looked at side by side."""
+"""Batch size for linearisation: number of points of a motion that are evaluated together."""
 
 
 class RobotSimulator(Simulated):
-    """Base of the simulators of robots; `robot_simulator` makes one of a model file.
+    """Base class of robot simulators; `robot_simulator` makes one from a model file.
 
     Attributes:
-        robot: whose.
-        numerics: the file's own step and integrator, or others.
+        robot: the robot.
+        numerics: time step and integrator, from the model file or changed.
+        free: numbers of the model file that are parameters.
     """
 
     system: ClassVar[type[RobotSystem]] = RobotSystem
@@ -96,32 +98,32 @@ class RobotSimulator(Simulated):
 
     @classmethod
     def stepped_by(cls, numerics: Numerics) -> type[RobotSimulator]:
-        """The same robot, stepped in another way."""
-        # The robot stays as its file states it, so that a result can say what is to change there.
+        """Make the simulator of the same robot with other integrator settings."""
+        # The robot keeps the settings of its file, so that a result can state what to change there.
         return robot_simulator(cls.robot, cls.free, numerics)
 
     @classmethod
     def with_friction_form(cls, form: FrictionForm) -> type[RobotSimulator]:
-        """The same robot, whose effects add dry friction in another form of MuJoCo's.
+        """Make the simulator of the same robot with another form of the dry friction of effects.
 
         Args:
             form: ``stiff`` for Coulomb friction; ``soft`` for the solver parameters of the model
-                file, or MuJoCo's defaults where the file states none.
+                file, or MuJoCo's defaults if the file specifies none.
         """
         return robot_simulator(cls.robot.with_friction_form(form), cls.free, cls.numerics)
 
     @classmethod
     def halved(cls) -> type[RobotSimulator]:
-        """The same robot at half its step."""
+        """Make the simulator of the same robot with half the time step."""
         return cls.stepped_by(cls.numerics._replace(timestep=0.5 * cls.numerics.timestep))
 
     @property
     def step(self) -> float:
-        """Seconds of a step."""
+        """Step length in seconds."""
         return self.engine.largest_step
 
     def _acting(self, theta: Array) -> Acting:
-        """See `Simulated`; freed numbers come first, and families in their parts."""
+        """Return active effects, see `Simulated`: free parameters first, families expanded."""
         acting: list[tuple[Effect, Array]] = []
         place = 0
         for effect in self._freed:
@@ -133,13 +135,20 @@ class RobotSimulator(Simulated):
         return tuple((effect, c) for effect, c in parts if c.any())
 
     def acting(self, theta: Array) -> Acting:
-        """Effects at one place each with their coefficients (K, L, 1), for rows of parameters."""
+        """Return the active effects at one place each, for rows of parameters.
+
+        Args:
+            theta: (L, p) parameters.
+
+        Returns:
+            Effects with their coefficients (K, L, 1).
+        """
         return self._acting(theta)
 
     def _simulated(
         self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> Array:
-        """See `Simulated`."""
+        """Simulate observations, see `Simulated`."""
         acting = self._acting(theta)
         runs = make_runs(scenarios, by_initial=True)
         commands = [self.run_inputs(s) for s in runs.distinct]
@@ -147,7 +156,7 @@ class RobotSimulator(Simulated):
         return self._lanes(acting, runs, commands, x, v)
 
     def observed(self, work: Work) -> Array:
-        """Observations (n, T, C) of lanes of one run, whatever acts on each."""
+        """Simulate observations (n, T, C) of the batch elements of one run."""
         runs = Runs((work.scenario,), np.zeros(len(work.x), dtype=np.intp))
         return self._lanes(work.acting, runs, [work.commands], work.x, work.v)
 
@@ -159,15 +168,15 @@ class RobotSimulator(Simulated):
         x: Array,
         v: Array,
     ) -> Array:
-        """Observations (L, T, C) of lanes that begin at x and v (L, D)."""
+        """Simulate observations (L, T, C) of batch elements that begin at x and v (L, D)."""
         longest = max(s.times.size for s in runs.distinct)
         result = np.full((len(x), longest, len(self.channels)), np.nan)
         derived = lanes_with(acting, len(x), derives)
         asked = lanes_with(acting, len(x), is_asked)
-        # A lane whose numbers overflow is NaN in the end, and nothing is printed of it.
+        # A diverging batch element becomes NaN, so floating-point warnings are suppressed.
         with np.errstate(all="ignore"), quiet():
             for series, kind, lanes in _alike(acting, derived, asked):
-                # Lanes of one run lie together: what they share is computed once.
+                # Batch elements are sorted by run, so that data common to a run are computed once.
                 lanes = lanes[np.argsort(runs.of[lanes], kind="stable")]
                 for part in np.array_split(lanes, max(-(-lanes.size // LANES), 1)):
                     works = [
@@ -184,11 +193,13 @@ class RobotSimulator(Simulated):
                     try:
                         done = self._simulate(works, part_of(acting, part), *bits, series)
                     except RefusedModelError:
-                        # Its lanes stay NaN, as those of a motion that explodes; the rest goes on.
+                        # These elements stay NaN, like those of a diverging motion; the others are
+                        # simulated.
                         continue
                     for (_, own), seen in zip(by_run(runs, part), done, strict=True):
                         result[own, : seen.shape[1]] = seen
-        result += 0.0  # no zero is negative: whatever made it, it is the same zero
+        # Negative zeros become positive, so that results do not depend on their origin.
+        result += 0.0
         return result
 
     def _simulate(
@@ -199,18 +210,19 @@ class RobotSimulator(Simulated):
         asked: bool,
         series: Added = (),
     ) -> list[Array]:
-        """Observations (n, T, C) of the lanes of each run, all stepped together.
+        """Simulate observations (n, T, C) of the batch elements of each run, in one batch.
 
         Args:
-            works: the lanes, run by run.
-            acting: what acts on all of them.
-            derived: whether constants of the model follow from what acts.
-            asked: whether forces are asked for in every step.
-            series: what acts in series with joints.
+            works: batch elements of each run.
+            acting: effects active on all of them.
+            derived: whether effects change constants that MuJoCo derives.
+            asked: whether forces are evaluated in every step.
+            series: effects in series with joints.
         """
         if not works:
             return []
-        # What is felt now is read in the step that begins now.
+        # A sensor at the end needs a further step, since MuJoCo computes its reading within the
+        # step that begins then.
         felt = self._feels()
         sizes = [self.steps_of(instants(work)) for work in works]
         given = [self.controls(work, size + felt) for work, size in zip(works, sizes, strict=True)]
@@ -229,35 +241,40 @@ class RobotSimulator(Simulated):
         return seen
 
     def _afloat(self, works: Sequence[Work]) -> Afloat:
-        """Where what floats begins in the lanes of all runs."""
+        """Return the initial states of floating bodies for all batch elements."""
         begun = [self.begins_afloat(work) for work in works]
         sizes = [len(work.x) for work in works]
         return Afloat(*(np.repeat(rows, sizes, axis=0) for rows in zip(*begun, strict=True)))
 
     def begins_afloat(self, work: Work) -> Afloat:
-        """Where what floats begins in a run: as the recording states it, else as the file does."""
+        """Return the initial state of floating bodies, from the recording or the model file."""
         return self._floating.begun(self.run_initial(work.scenario) if self._floating else {})
 
     def steps_of(self, times: Array) -> int:
-        """How many steps it takes to the last of some instants since the start."""
+        """Return the number of steps to the last of some times since the start."""
         return max(int(np.ceil(times[-1] / self.step - SHARE)), 1)
 
     @cached_property
     def _drives(self) -> bool:
-        """Whether it is recorded what actuators exert."""
+        """Whether drive forces are recorded."""
         return any(c.name.startswith("tau.") for c in self.channels)
 
     @cached_property
     def _rated(self) -> frozenset[int]:
-        """Actuators that take the rate of their command besides."""
+        """Actuators whose second control is the rate of their command."""
         return frozenset(a.id for a in self.robot.actuators if a.name in self.robot.rated)
 
     def _feels(self) -> bool:
-        """Whether a channel is recorded that MuJoCo computes within a step."""
+        """Return whether a recorded channel is computed by MuJoCo within a step."""
         return any(c.name.startswith(("tau.", "s.")) for c in self.channels)
 
     def controls(self, work: Work, steps: int) -> Given:
-        """What lanes of one run are given over the steps."""
+        """Compute the inputs of the batch elements of one run over all steps.
+
+        Args:
+            work: batch elements of the run.
+            steps: number of steps.
+        """
         n = len(work.x)
         of_run = self.step, work.scenario, work.commands, work.acting, n, steps
         felt = felt_over(*of_run)
@@ -272,7 +289,7 @@ class RobotSimulator(Simulated):
             controls[:, :, actuator.control] = felt[name]
             if self._drives:
                 given[:, :, actuator.control] = instant[name]
-            # What acts on the error's rate is given the rate of the command.
+            # A derivative gain on the error's rate needs the rate of the command.
             if actuator.id in self._rated:
                 rate = np.diff(felt[name], axis=1, prepend=felt[name][:, :1]) / self.step
                 controls[:, :, actuator.control + 1] = rate
@@ -286,7 +303,7 @@ class RobotSimulator(Simulated):
         for one in activation_filters(self.robot):
             taken = controls[:, :, one.actuator.control]
             begun[:, one.address] = self._first_activation(one, work, taken)
-            # Servos follow the activation in place of the command.
+            # The servo's effective set point is the activation instead of the command.
             activations = self._activations(one, taken, begun[:, one.address])
             felt = {**felt, f"u.{one.actuator.name}": activations[:, :-1]}
         off = off_steps(self.robot, work.scenario, self.step, steps)
@@ -297,8 +314,8 @@ class RobotSimulator(Simulated):
 
         Args:
             one: the filter.
-            work: the lanes of the run.
-            controls: (n, S) its controls.
+            work: batch elements of the run.
+            controls: (n, S) controls of the filter.
         """
         stated = stated_activations(self.robot, work.scenario.initial)
         if one.state in stated:
@@ -323,18 +340,22 @@ class RobotSimulator(Simulated):
         return one.activations(controls, begun, self.step, fourth)
 
     def run_initial(self, scenario: Scenario) -> dict[str, float]:
-        """See `Simulator`; activations of filters are not states that are estimated."""
+        """Return initial states, see `Simulator`; filter activations are not estimated states."""
         stated = stated_activations(self.robot, scenario.initial)
         own = {name: v for name, v in scenario.initial.items() if name not in stated}
         return super().run_initial(replace(scenario, initial=own))
 
     def wide(self, acting: Acting = ()) -> Bench:
-        """Lanes for looking at many instants of one motion at once, in which this acts."""
+        """Return the batch for linearisation, with the joints in series that effects need.
+
+        Args:
+            acting: effects active in the motion.
+        """
         (series,) = by_series(acting, 1)
         return self._bench(True, WIDTH, series)
 
     def half_steps(self, acting: Acting = ()) -> Bench:
-        """Return the lanes of `wide` with half the time step."""
+        """Return the batch of `wide` with half the time step."""
         (series,) = by_series(acting, 1)
         engine = self.engine
         assert isinstance(engine, RobotEngine)
@@ -343,12 +364,12 @@ class RobotSimulator(Simulated):
         return bench_cache(self.robot).bench(series, True, WIDTH, settings)
 
     def stepped(self, work: Work, given: Given, more: Sequence[str] = ()) -> Made:
-        """Step lanes of one run, whatever acts on them.
+        """Step the batch elements of one run.
 
         Args:
-            work: the lanes.
-            given: over the steps.
-            more: fields of MuJoCo's data to record besides.
+            work: batch elements of the run.
+            given: inputs over the steps.
+            more: additional fields of MuJoCo's data to record.
         """
         n = len(work.x)
         derived = bool(lanes_with(work.acting, n, derives).any())
@@ -367,7 +388,8 @@ class RobotSimulator(Simulated):
         series: Added = (),
     ) -> Made:
         n = len(start.x)
-        # A lane alone shall not set the constants of all others.
+        # A single simulation uses a small batch, so that constants need not be derived for a whole
+        # one.
         bench = self._bench(derived, 1 if n == 1 else LANES, series)
         places, second = bench.places, bench.second
         bench.load(filled(natives(start.acting), n, bench.count))
@@ -383,7 +405,7 @@ class RobotSimulator(Simulated):
             forces = bench.spread(given.forces)
             asked_of = None
             if given.off.any():
-                # Compiled effects take servos for equally stiff in all steps.
+                # Compiled effects assume a constant servo stiffness over all steps.
                 asking.working = working_servos(bench.robot, places.velocities, given.off)
             else:
                 asked_of = compiled(asking)
@@ -412,7 +434,7 @@ class RobotSimulator(Simulated):
         return bench_cache(self.robot).bench(series, derived, count, settings)
 
     def _shown(self, made: Made, work: Work, times: Array, steps: int) -> Array:
-        """What the sensors record: (n, T, C)."""
+        """Compute the recorded observations (n, T, C), including sensor effects."""
         columns = []
         for channel in self.channels:
             values, slopes = self._signal(made, channel.name, steps)
@@ -428,9 +450,7 @@ class RobotSimulator(Simulated):
         return result
 
     def _signal(self, made: Made, name: str, steps: int) -> tuple[Array, Array | None]:
-        """Values of a channel at the beginning of every step and at the end, (n, S + 1), and their
-        slopes where they are known.
-        """
+        """Return the values (n, S + 1) of a channel at all steps, and their slopes if known."""
         kind, _, of = name.partition(".")
         upto = slice(steps + 1)
         if kind in ("q", "qd"):
@@ -441,7 +461,7 @@ class RobotSimulator(Simulated):
         return made.fields["sensordata"][:, upto, self.column(name)], None
 
     def column(self, channel: str) -> int:
-        """Where in its sensors' data MuJoCo has a channel that is no state."""
+        """Return the column in MuJoCo's sensor data of a channel that is not a state."""
         kind, _, of = channel.partition(".")
         if kind == "tau":
             return self._bench(False, 1).drives[of]
@@ -449,8 +469,11 @@ class RobotSimulator(Simulated):
 
 
 def _alike(acting: Acting, derived: Mask, asked: Mask) -> Iterator[tuple[Added, int, Places]]:
-    """Lanes that can go together: what acts in series with joints in them, the number of their
-    kind, and which they are.
+    """Group batch elements that can be simulated together.
+
+    Yields:
+        Effects in series with joints, a bit field (1: derived constants change, 2: forces are
+        evaluated in every step), and the indices of the batch elements.
     """
     for series, own in by_series(acting, len(derived)).items():
         there = np.zeros(len(derived), dtype=bool)
@@ -463,18 +486,19 @@ def _alike(acting: Acting, derived: Mask, asked: Mask) -> Iterator[tuple[Added, 
 def robot_simulator(
     robot: Robot, free: Sequence[str] = (), numerics: Numerics | None = None
 ) -> type[RobotSimulator]:
-    """The simulator of a robot.
+    """Make the simulator class of a robot.
 
     Args:
-        robot: that was read.
-        free: numbers of the file to tune, as ``damping@*`` or ``mass@forearm``.
-        numerics: other than those of the file.
+        robot: robot as read from its model file.
+        free: numbers of the file to tune, such as ``damping@*`` or ``mass@forearm``.
+        numerics: time step and integrator; those of the file if None.
 
     Raises:
-        InputError: it has no joint that can be explained, or a name in `free` does not exist.
+        InputError: the robot has no joint with one coordinate, or a name in `free` does not exist.
     """
     numerics = numerics or own_numerics(robot)
-    # The class is made at run time: no source text distinguishes it from that of another robot.
+    # The class is created at run time, so its source text does not identify the robot; the digest
+    # does.
     told = repr((robot.digest, tuple(free), tuple(numerics)))
     told += "" if robot.friction_form == "stiff" else robot.friction_form
     system = system_of(robot, free)

@@ -1,5 +1,6 @@
-"""The places of a robot where something may be missing: its joints, actuators, bodies and channels,
-with what the file states of each.
+"""List the places of a robot where effects may act, and what its model file specifies there.
+
+Places are joints, actuators, bodies and channels.
 """
 
 from __future__ import annotations
@@ -27,28 +28,28 @@ WORDS = {
     "mass": "mass.scale",
     "stiffness": "spring.linear",
 }
-"""MuJoCo's words for what a file states, and the effects that change it."""
+"""MuJoCo's words for numbers of a model file, and the effects that change them."""
 
 
 class Spot(NamedTuple):
     """A place at which an effect may act.
 
     Attributes:
-        name: of the joint, actuator, body or channel.
-        kind: of the coordinate whose units count: hinge or slide.
-        coordinate: its number; None where it has none.
-        signal: the input or channel; empty for a joint or body.
-        unit: of the signal.
-        size: a typical force along the coordinate, N or N m.
-        inertia: about it, kg or kg m^2.
-        stated: what the file states, by name of the effect that changes it.
-        words: how a sentence calls it.
-        servo: whether it is an actuator that follows a set point of its position.
-        last: whether it is a joint, the last one of its body.
-        coupled: whether it is a joint whose drive may be coupled to the joint before.
-        offsets: of a body, by axis of its frame (``x``, ``y``, ``z``), the lowest and the highest
-            offset in metres that leaves its centre of mass within the link; both zero along an
-            axis where an offset cannot be observed.
+        name: name of the joint, actuator, body or channel.
+        kind: kind of the coordinate whose units apply: hinge or slide.
+        coordinate: index of the coordinate; None if there is none.
+        signal: name of the input or channel; empty for a joint or body.
+        unit: unit of the signal.
+        size: typical force along the coordinate, in N or N m.
+        inertia: inertia about the coordinate, in kg or kg m^2.
+        stated: values that the model file specifies, by name of the effect that changes them.
+        words: name of the place in a sentence.
+        servo: whether it is an actuator that follows a position set point.
+        last: whether it is the last joint of its body.
+        coupled: whether it is a joint whose drive may be coupled to the preceding joint.
+        offsets: for a body, lowest and highest offset in metres that leaves its centre of mass
+            within the link, by axis of its frame (``x``, ``y``, ``z``); both are zero along an axis
+            where an offset cannot be observed.
     """
 
     name: str
@@ -67,11 +68,11 @@ class Spot(NamedTuple):
 
 
 def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[Spot]]:
-    """The places of a robot by kind: joint, actuator, body, channel.
+    """List the places of a robot by kind: joint, actuator, body, channel.
 
     Args:
-        robot: whose.
-        channels: names and units of those that it can show.
+        robot: robot whose places are listed.
+        channels: names and units of the channels that it can observe.
     """
     from sims.robot.scales import coefficient_scales
 
@@ -133,14 +134,14 @@ def spots(robot: Robot, channels: Sequence[tuple[str, str]]) -> dict[str, list[S
 
 
 def _control_unit(kind: str, on: Spot) -> str:
-    """The unit of an actuator's control."""
+    """Return the unit of an actuator's control."""
     length = "rad" if on.kind == "hinge" else "m"
     force = "N*m" if on.kind == "hinge" else "N"
     return {"position": length, "velocity": f"{length}/s", "motor": force}.get(kind, "1")
 
 
 def _gains(robot: Robot, actuator: int) -> dict[str, float]:
-    """What a servo's file states of its gains; zero where it is no servo."""
+    """Return the servo gains of an actuator in the model file; zero if it is not a servo."""
     bias = robot.compiled.actuator_biasprm[actuator]
     return {"actuator.stiffness": float(bias[1]), "actuator.damping": float(bias[2])}
 

@@ -1,5 +1,6 @@
-"""What MJCF says of a joint, a body, an actuator and the options, and where a compiled model keeps
-it: so that a number of the compiled model can be stated in a file, or set in a spec.
+"""MJCF attributes of model elements, and the fields of the compiled model that store them.
+
+With this map a number of the compiled model can be written to a file, or set in a spec.
 """
 
 from __future__ import annotations
@@ -11,16 +12,24 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 Kind = Literal["joint", "body", "weight", "actuator", "option", "compiler"]
-"""Kinds of elements; a ``weight`` is what a body says of its own weight, next to its inertial."""
+"""Kinds of model elements.
+
+Kind ``weight`` is the gravity compensation of a body, separate from its inertial.
+"""
 
 Fields = dict[str, Any]
-"""Fields of a compiled model by name, arrays (1, ...): one lane."""
+"""Fields of a compiled model by name, arrays (1, ...) for one batch element."""
 
 Values = tuple[float, ...]
 
 
 class Element(NamedTuple):
-    """An element of a model file: its kind and its number in the compiled model."""
+    """An element of a model file.
+
+    Attributes:
+        kind: kind of the element.
+        id: number in the compiled model.
+    """
 
     kind: Kind
     id: int
@@ -28,12 +37,13 @@ class Element(NamedTuple):
 
 @dataclass
 class Statement:
-    """What a file is to say of one element.
+    """Attribute values that a file should specify for one element.
 
     Attributes:
-        element: which.
-        values: by MJCF's attribute, in MuJoCo's units (angles in rad).
-        insisted: whether what stands beside it has to be stated as well: it was not enough before.
+        element: the element.
+        values: values by MJCF attribute, in MuJoCo's units (angles in rad).
+        insisted: whether related attributes must be written as well, since the values alone had no
+            effect.
     """
 
     element: Element
@@ -42,12 +52,12 @@ class Statement:
 
 
 class Attribute(NamedTuple):
-    """An attribute of MJCF.
+    """An MJCF attribute.
 
     Attributes:
-        name: in the file.
-        spec: in an MjSpec.
-        read: its values, from the fields and an element's addresses.
+        name: name in the file.
+        spec: name in an MjSpec.
+        read: reads its values from the model fields and the addresses of an element.
     """
 
     name: str
@@ -60,7 +70,14 @@ def _of(name: str, address: str = "id") -> Callable[[Fields, Any], Any]:
 
 
 class Where(NamedTuple):
-    """Where a compiled model keeps what it knows of an element."""
+    """Addresses of an element in the fields of a compiled model.
+
+    Attributes:
+        id: number of the element.
+        velocity: address of a joint's velocity (dof).
+        position: address of a joint's position.
+        control: address of an actuator's control.
+    """
 
     id: int
     velocity: int = 0
@@ -117,7 +134,7 @@ ATTRIBUTES: Mapping[Kind, tuple[Attribute, ...]] = {
     ),
     "compiler": (),
 }
-"""By kind of element. An inertial is of its body."""
+"""MJCF attributes by kind of element; those of an inertial belong to its body."""
 
 _NAMES = (
     *("dof_damping", "dof_dampingpoly", "dof_frictionloss", "dof_solref", "dof_solimp"),
@@ -136,11 +153,11 @@ CHOICES: Mapping[str, str] = {
     "biastype": "mjtBias",
     "integrator": "mjtIntegrator",
 }
-"""Attributes that are words, and MuJoCo's enumerations of them."""
+"""Attributes whose values are words, and the MuJoCo enumerations of these words."""
 
 
 def fields(model: Any) -> Fields:
-    """A copy of what a compiled model says of all elements."""
+    """Copy the fields of a compiled model that store attributes."""
     found = {name: np.array(getattr(model, name))[None] for name in _NAMES}
     for name in ("timestep", "integrator", "gravity"):
         found[f"opt.{name}"] = np.array(getattr(model.opt, name))[None]
@@ -148,7 +165,7 @@ def fields(model: Any) -> Fields:
 
 
 def where(model: Any, element: Element) -> Where:
-    """Where a compiled model keeps what it knows of an element."""
+    """Return the addresses of an element in the fields of a compiled model."""
     i = element.id
     if element.kind == "joint":
         return Where(i, int(model.jnt_dofadr[i]), int(model.jnt_qposadr[i]))
@@ -158,8 +175,9 @@ def where(model: Any, element: Element) -> Where:
 
 
 def elements(model: Any) -> list[Element]:
-    """All of which something can be stated: joints with one coordinate, bodies, actuators with one
-    control, the options.
+    """List the elements of a model whose attributes can be written.
+
+    They are joints with one coordinate, bodies, actuators with one control, and the options.
     """
     import mujoco
 
@@ -173,18 +191,31 @@ def elements(model: Any) -> list[Element]:
 
 
 def lacking(model: Any, wanted: Fields, tolerance: float) -> list[Statement]:
-    """What has to be stated of a compiled model so that it says what is wanted.
+    """Find the attributes to write so that a compiled model gets the wanted fields.
 
     Args:
-        model: what a file says.
-        wanted: what it should say.
-        tolerance: relative difference that is none.
+        model: compiled model of the present file.
+        wanted: wanted fields.
+        tolerance: relative difference that is ignored.
+
+    Returns:
+        One statement for each element with differences.
     """
     return differing(model, fields(model), wanted, tolerance)
 
 
 def differing(model: Any, found: Fields, wanted: Fields, tolerance: float) -> list[Statement]:
-    """What has to be stated where `found` is what is; otherwise as `lacking`."""
+    """Find the attributes in which two sets of model fields differ.
+
+    Args:
+        model: compiled model with the elements.
+        found: present fields.
+        wanted: wanted fields.
+        tolerance: relative difference that is ignored.
+
+    Returns:
+        One statement with the wanted values for each element with differences.
+    """
     statements = []
     for element in elements(model):
         at = where(model, element)
@@ -194,7 +225,7 @@ def differing(model: Any, found: Fields, wanted: Fields, tolerance: float) -> li
             if not _same(is_now, should, tolerance):
                 values[attribute.name] = tuple(float(v) for v in np.atleast_1d(should))
         if element.kind == "body" and values:
-            # An inertial is stated whole, or not at all.
+            # An inertial must be written with all its attributes.
             values = whole(model, element, wanted)
         if values:
             statements.append(Statement(element, values))
@@ -202,7 +233,13 @@ def differing(model: Any, found: Fields, wanted: Fields, tolerance: float) -> li
 
 
 def whole(model: Any, element: Element, wanted: Fields) -> dict[str, Values]:
-    """All attributes of an element."""
+    """Read the wanted values of all attributes of an element.
+
+    Args:
+        model: compiled model with the element.
+        element: the element.
+        wanted: wanted fields.
+    """
     at = where(model, element)
     return {
         attribute.name: tuple(float(v) for v in np.atleast_1d(attribute.read(wanted, at)))
@@ -219,7 +256,12 @@ def _same(one: Any, other: Any, tolerance: float) -> bool:
 
 
 def word(name: str, value: float) -> str:
-    """The word of MJCF for a number of an enumeration."""
+    """Return the MJCF word for a value of an enumeration.
+
+    Args:
+        name: name of the attribute.
+        value: number of the enumeration.
+    """
     import mujoco
 
     if name == "interp":

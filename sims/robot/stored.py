@@ -1,5 +1,6 @@
-"""The robot that an extended simulator's file names: its model file, what a recording added to it,
-and what of it was free.
+"""Reference to a robot in the file of an extended simulator.
+
+It contains the model file, the additions of the recording, and the free parameters.
 """
 
 from __future__ import annotations
@@ -23,15 +24,16 @@ KEYS = ("model", "digest", "free", "actuators", "engine", "numerics", "friction_
 
 @dataclass(frozen=True)
 class StoredRobot:
-    """A robot as a file names it.
+    """Reference to a robot, as stored in extended.toml.
 
     Attributes:
-        path: of its model file.
-        digest: of all that was read with it; None for whatever the file says now.
-        free: numbers of it that are parameters, as ``damping@*``.
-        actuators: that a recording added, by name.
-        engine: time step and integrator that it stated in place of the file's.
-        numerics: ``timestep`` and ``integrator`` other than those, of what was found.
+        path: path of the model file.
+        digest: digest of the model file and everything that was read with it; None accepts any
+            content.
+        free: numbers of the model file that are free parameters, such as ``damping@*``.
+        actuators: actuators that a recording added, by name.
+        engine: time step and integrator of the recording that replace those of the model file.
+        numerics: ``timestep`` and ``integrator`` that differ from those; found by explain.
         friction_form: form of the dry friction that effects add (`sims.robot.friction_form`).
     """
 
@@ -44,7 +46,11 @@ class StoredRobot:
     friction_form: FrictionForm = "stiff"
 
     def document(self, folder: Path | None) -> dict[str, Any]:
-        """As TOML in a file of this folder; the model file is named alone where there is none."""
+        """Return the reference as a TOML document of a file in a folder.
+
+        Args:
+            folder: folder of the TOML file; None stores the model file's name without a folder.
+        """
         where = self.path.name if folder is None else _from(folder, self.path)
         document = {key: value for key, value in asdict(self).items() if value and key in KEYS}
         # A file without the key means stiff friction, as files of earlier versions do.
@@ -54,12 +60,12 @@ class StoredRobot:
         return {"model": where, **document, **free}
 
     def simulator(self) -> type[RobotSimulator]:
-        """Its simulator.
+        """Make the simulator of the robot.
 
         Raises:
             InputError: the model file is missing, cannot be read or has changed.
         """
-        # Loaded here alone: most simulators have nothing to do with robots.
+        # These modules are imported lazily, since most simulators do not need robots.
         from sims.robot.numerics import Numerics, own_numerics
         from sims.robot.reading import read
         from sims.robot.simulator import robot_simulator
@@ -73,7 +79,7 @@ class StoredRobot:
 
 
 def of(kind: type[RobotSimulator]) -> StoredRobot:
-    """What a file has to name for a robot's simulator."""
+    """Make the reference to the robot of a simulator."""
     from sims.robot.numerics import own_numerics
 
     robot = kind.robot
@@ -90,24 +96,24 @@ def of(kind: type[RobotSimulator]) -> StoredRobot:
 
 
 def _from(folder: Path, path: Path) -> str:
-    """A path as seen from a folder, where the two lie in one tree; else as it is."""
+    """Return a path relative to a folder if both are in one tree, else the absolute path."""
     folder, path = folder.resolve(), path.resolve()
     common = Path(os.path.commonpath([folder, path])) if folder.drive == path.drive else None
-    # The way by the root of a file system is good in no other place than this one.
+    # A relative path through the root of a file system would be valid on this machine only.
     if common is None or common == Path(common.anchor):
         return str(path)
     return Path(os.path.relpath(path, folder)).as_posix()
 
 
 def read_stored(source: Path, document: Mapping[str, Any]) -> StoredRobot:
-    """What a file says of a robot.
+    """Read a robot reference from the document of a file.
 
     Args:
-        source: the file; its model file is named from its folder.
-        document: its tables.
+        source: the file; the path of the model file is relative to its folder.
+        document: content of the file.
 
     Raises:
-        InputError: something is malformed.
+        InputError: the document is malformed.
     """
     if "system" in document:
         raise InputError(f"{source}: expected system or model, found both; leave one out")
@@ -132,7 +138,7 @@ def _friction_form(source: Source, value: Any) -> FrictionForm:
 
 
 def _numerics(source: Source, value: Any) -> dict[str, Any]:
-    """``[numerics]``: a step in s, and an integrator of MuJoCo's."""
+    """Check the table ``[numerics]``: a time step in seconds, and one of MuJoCo's integrators."""
     from sims.robot.numerics import INTEGRATORS
 
     given = table(source, "numerics", value)

@@ -1,7 +1,7 @@
-"""Drives that are switched off: their actuators exert nothing in these steps.
+"""Actuators that are switched off in some steps and then exert no force.
 
-An actuator that is off has a force range from zero to zero. So MuJoCo makes its force zero whatever
-its kind, and its implicit integrators take no derivative of it, as of any force at a limit.
+An actuator that is off gets a force range from zero to zero. So its force is zero whatever its
+kind, and MuJoCo's implicit integrators take no derivative of it, as for any force at a limit.
 """
 
 from __future__ import annotations
@@ -19,13 +19,25 @@ from sims.robot.model import Robot
 Mask = NDArray[np.bool_]
 
 FORCE_FIELDS = ("actuator_forcelimited", "actuator_forcerange")
-"""Fields of a model that are written."""
+"""Model fields that switch an actuator off: whether its force is limited, and its force range."""
 MIDDLE = 0.5
-"""Place within a step at which it is decided whether a drive is off."""
+"""Fraction of a step after which the on/off state of an actuator is sampled for the whole step."""
 
 
 def off_steps(robot: Robot, scenario: Scenario, step: float, steps: int) -> Mask:
-    """Return (S, K) in which steps of a run each actuator is off; held from sample to sample."""
+    """Compute in which steps of a run each actuator is switched off.
+
+    The state is held from one sample of the recording to the next.
+
+    Args:
+        robot: robot whose actuators are meant.
+        scenario: run with its sample times and the actuators that are off at each sample.
+        step: step length in seconds.
+        steps: number S of steps.
+
+    Returns:
+        (S, K) whether each of the K actuators is off.
+    """
     result = np.zeros((steps, len(robot.actuators)), dtype=bool)
     if not scenario.off:
         return result
@@ -38,7 +50,7 @@ def off_steps(robot: Robot, scenario: Scenario, step: float, steps: int) -> Mask
 
 
 def constant_stretches(off: Mask) -> Iterator[slice]:
-    """Yield stretches of steps in which no lane of (n, S, K) changes."""
+    """Yield the slices of steps within which no element of an on/off mask (n, S, K) changes."""
     changes = np.flatnonzero((off[:, 1:] != off[:, :-1]).any(axis=(0, 2))) + 1
     edges = [0, *changes.tolist(), off.shape[1]]
     for first, end in pairwise(edges):
@@ -46,10 +58,10 @@ def constant_stretches(off: Mask) -> Iterator[slice]:
 
 
 class ForceRanges:
-    """The force ranges of lanes' actuators, as they are loaded, and zero for those that are off.
+    """Actuator force ranges of batch elements, which can be set to zero to switch actuators off.
 
     Args:
-        fields: of the lanes' models, by name.
+        fields: model fields of the batch elements by name; includes all of `FORCE_FIELDS`.
     """
 
     def __init__(self, fields: Mapping[str, Any]) -> None:
@@ -57,7 +69,10 @@ class ForceRanges:
         self._own = self._limited.copy(), self._range.copy()
 
     def write(self, off: Mask) -> None:
-        """Switch actuators of the first n lanes on and off, (n, K)."""
+        """Switch actuators of the first n batch elements off where `off` (n, K) is true.
+
+        All their other actuators are switched on.
+        """
         limited, limits = self._own
         n = len(off)
         self._limited[:n] = np.where(off, True, limited[:n])
@@ -69,12 +84,15 @@ class ForceRanges:
 
 
 def working_servos(robot: Robot, velocities: Any, off: Mask) -> Array:
-    """Return 0 where the position servo of a coordinate is off, and 1 elsewhere.
+    """Return 0 for coordinates whose position servo is switched off, and 1 for all others.
 
     Args:
-        robot: whose.
-        velocities: (D,) addresses of the coordinates' velocities.
-        off: (..., K) which actuators are off.
+        robot: robot whose actuators are meant.
+        velocities: (D,) addresses of the velocities of the coordinates in `qvel`.
+        off: (..., K) whether each actuator is off.
+
+    Returns:
+        (..., D) zeros and ones.
     """
     columns = {int(place): i for i, place in enumerate(velocities)}
     result = np.ones((*off.shape[:-1], len(columns)))

@@ -26,22 +26,22 @@ INTEGRATES = (
     "the actuator integrates its control (dyntype integrator), and no recording says where its "
     "integral begins; expected a position servo, whose input is the integral"
 )
-"""Why a recording cannot have the control of an integrator."""
+"""Reason why a recording cannot contain the control of an integrator actuator."""
 
 
 class RobotSystem(System):
-    """The declaration behind a robot's simulator, made from its model file.
+    """The system of a robot's simulator, created from its model file.
 
     Attributes:
-        robot: whose.
+        robot: the robot.
         spots: its places by kind.
-        alone: (D,) each joint as a system of its own.
-        drives: by coordinate, the inputs of its actuators.
-        servos: by coordinate, the input that is the set point of its position servo.
-        gears: and by how much that turns for each unit of the coordinate.
-        activations: names under which a recording may state the first activations of filters.
-        refused_inputs: by input, why a recording cannot have it.
-        traced: by inputs, the effects that were compiled (`sims.robot.compiled`).
+        alone: (D,) each joint as a separate system.
+        drives: inputs of the actuators of each coordinate.
+        servos: input that is the set point of the position servo, by coordinate.
+        gears: gear of that servo, by coordinate: its set point per unit of the coordinate.
+        activations: names under which a recording may specify initial activations of filters.
+        refused_inputs: reason why a recording cannot contain an input, by input.
+        traced: compiled effects by inputs (`sims.robot.compiled`).
     """
 
     name = "robot"
@@ -70,17 +70,18 @@ class RobotSystem(System):
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        # What is found of one robot is not of another, nor of the same with numbers freed.
+        # These caches must not be shared with other robots, or with the same robot with free
+        # parameters.
         cls.traced, cls._placed, cls.left_out = {}, {}, {}
 
     @classmethod
     def gear(cls, coordinate: int) -> float:
-        """See `System`."""
+        """Return the gear of a coordinate's position servo, see `System`."""
         return cls.gears.get(coordinate, 1.0)
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
-        """The effect at every place, without those that the user has declared free."""
+        """Return the effect at each of its places, without effects that are free parameters."""
         if effect.name not in cls._placed:
             found = places.classes(effect, cls.spots, FIELDS, cls._compiles)
             cls._placed[effect.name] = tuple(found)
@@ -88,8 +89,9 @@ class RobotSystem(System):
 
     @classmethod
     def _compiles(cls, effect: type[Effect]) -> bool:
-        """Whether the model compiles that an effect at one place needs; says in `left_out` where it
-        does not.
+        """Return whether the model with an effect at one place compiles.
+
+        If not, MuJoCo's reason is stored in `left_out`.
         """
         if effect.of == coupled.EFFECT:
             added: Added = (coupled.ANY,)
@@ -104,17 +106,17 @@ class RobotSystem(System):
 
     @classmethod
     def is_free(cls, effect: type[Effect]) -> bool:
-        """Whether a coefficient of it is a parameter: it can be no cause beside."""
+        """Return whether a coefficient of an effect is a parameter; then it cannot be a cause."""
         members = getattr(effect, "members", ())
         return effect.name in cls.freed or any(m.name in cls.freed for m in members)
 
     @classmethod
     def effect(cls, name: str) -> type[Effect] | None:
-        """The effect of a name such as ``friction.coulomb@elbow``.
+        """Find the effect with a name such as ``friction.coulomb@elbow``.
 
         Raises:
-            InputError: there is no such effect, or it has no such place; the message lists those
-                that there are.
+            InputError: there is no such effect, or it has no such place; the message lists the
+                existing ones.
         """
         base, _, place = name.partition("@")
         try:
@@ -138,14 +140,17 @@ class RobotSystem(System):
             return cls.effect(f"{base}@{cls.robot.body(place).name}")
         there = [one.place for one in known.values() if one.place]
         if place == FAMILY and len(there) == 1:
-            # Of one place every one of that kind is that place, and no family.
+            # If there is one place only, the family is this place.
             return known[f"{base}@{there[0]}"]
         raise unknown(f"place of effect {base} in robot {cls.name}", place, there or ["none"])
 
     @classmethod
     def freeable(cls, word: str) -> list[type[Effect]]:
-        """The effects whose coefficients a name of ``--free`` stands for, as ``damping@elbow`` in
-        MuJoCo's words or ``drag.linear@elbow``; ``@*`` is every place.
+        """Return the effects whose coefficients an entry of ``--free`` refers to.
+
+        Args:
+            word: name in MuJoCo's words such as ``damping@elbow``, or effect such as
+                ``drag.linear@elbow``; ``@*`` is every place.
         """
         base, _, place = word.partition("@")
         name = WORDS.get(base, base)
@@ -154,47 +159,47 @@ class RobotSystem(System):
             raise unknown(f"number of robot {cls.name}", base, there)
         found = cls.effect(f"{name}@{place}" if place else name)
         assert found is not None
-        # What is late is late everywhere: one number for all places.
+        # Shared effects, such as delays, have one number for all places.
         members = () if name in places.SHARED else getattr(found, "members", ())
         return [type(member) for member in members] or [found]
 
     @classmethod
     def words(cls) -> list[str]:
-        """MuJoCo's words for numbers that its file states."""
+        """List MuJoCo's words for numbers that the model file specifies."""
         return [word for word, name in WORDS.items() if cls._has(name)]
 
     @classmethod
     def _has(cls, name: str) -> bool:
-        """Whether it can have a registered effect anywhere."""
+        """Return whether the robot can have a registered effect at any place."""
         try:
             return bool(cls.placed(library.get(name)))
         except SkippedError:
             return False
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """The engine alone knows it: a matrix that changes with the pose."""
+        """Raise an error: only the engine computes the pose-dependent inertia matrix."""
         raise NotImplementedError
 
     def weight(self, moment: Moment) -> Array:
-        """The engine alone knows it."""
+        """Raise an error: only the engine computes gravity forces."""
         raise NotImplementedError
 
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """The engine reads the channels itself."""
+        """Raise an error: the engine reads the channels itself."""
         raise NotImplementedError
 
 
 def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
-    """The system of a robot.
+    """Make the system of a robot.
 
     Args:
-        robot: that was read.
-        free: numbers to tune, as ``damping@*`` or ``mass.scale@forearm``.
+        robot: robot as read from its model file.
+        free: numbers to tune, such as ``damping@*`` or ``mass.scale@forearm``.
 
     Raises:
-        InputError: it has no joint of one coordinate, or a name in `free` does not exist.
+        InputError: the robot has no joint with one coordinate, or a name in `free` does not exist.
     """
     joints = [joint for joint in robot.joints if joint.single]
     if not joints:
@@ -214,7 +219,7 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
         own = [a for a in robot.actuators if a.joint == joint.name]
         drives[number] = tuple(f"u.{a.name}" for a in own)
         follows = [a for a in own if a.kind == "position"]
-        # Of several which one is off would not show in the joint's motion.
+        # With several servos at one joint, its motion would not show which one has an error.
         if len(follows) == 1:
             servos[number] = f"u.{follows[0].name}"
             gears[number] = float(model.actuator_gear[follows[0].id, 0])
@@ -252,26 +257,35 @@ def system_of(robot: Robot, free: Sequence[str] = ()) -> type[RobotSystem]:
 
 
 def freed_effects(system: type[RobotSystem], free: Sequence[str]) -> list[type[Effect]]:
-    """The effects at one place each that the names of ``--free`` stand for, each once."""
+    """Return the effects that the names of ``--free`` refer to, without duplicates.
+
+    Args:
+        system: system of the robot.
+        free: names such as ``damping@*``.
+
+    Returns:
+        Effects at one place each, or shared by all places.
+    """
     by_name = {one.name: one for word in free for one in system.freeable(word)}
     return list(by_name.values())
 
 
 WIDER = 4.0
-"""Bounds of a freed number reach so many times as far as its plausible range."""
+"""Bounds of a free parameter, as a multiple of its plausible range."""
 GUESSED = 9.0
-"""Those of a servo's gain, as a share of what is stated."""
+"""Upper bound of a free servo gain's relative change, as a multiple of the specified gain."""
 
 
 def _parameters(effect: type[Effect]) -> list[Parameter]:
-    """Its coefficients as parameters, nominally what the file states."""
+    """Make parameters from an effect's coefficients; nominal values keep the file's values."""
     result = []
     for c in effect.coefficients:
         low, high = c.plausible[0]
-        # A gain that is free is a guess: it may be several times as large.
+        # A free gain is a guess, so the true value may be several times as large.
         guess = effect.at == "actuator" and c.least is not None
         bounds = WIDER * low, GUESSED if guess else WIDER * high
-        # What cannot be observed has no range of its own; the data will not fix it.
+        # A coefficient that cannot be observed has an empty range; it gets wider bounds, and the
+        # data will not identify it.
         if c.least is not None and c.least != c.most:
             most = np.inf if c.most is None else c.most
             bounds = max(bounds[0], c.least), min(bounds[1], most)
@@ -282,7 +296,7 @@ def _parameters(effect: type[Effect]) -> list[Parameter]:
 
 
 def _unit(robot: Robot, actuator: str) -> str:
-    """Of an actuator's control."""
+    """Return the unit of an actuator's control."""
     a = robot.actuator(actuator)
     if a.joint is None:
         return "1"
@@ -292,7 +306,7 @@ def _unit(robot: Robot, actuator: str) -> str:
 
 
 def _channels(robot: Robot) -> tuple[Channel, ...]:
-    """Position, velocity and drive of each joint, and the sensors of the model."""
+    """Return position, velocity and drive force channels of each joint, and the model's sensors."""
     joints = [joint for joint in robot.joints if joint.single]
     channels = [Channel(f"q.{j.name}", j.unit, says=f"position of joint {j.name}") for j in joints]
     channels += [

@@ -1,21 +1,23 @@
-"""What small changes make of a robot's motion, to first order: of hundreds of effects at the cost
-of a few dozen simulations.
+"""First-order propagation of small changes along a robot's motion (tangent linear model).
 
-With z = (q, v, a) the state, u the controls and f generalised forces, a step of MuJoCo is the map
-z_{t+1} = F(z_t, u_t, f_t; p) with p the numbers of the model. About one motion
+It computes the responses to hundreds of effects at the cost of a few dozen simulations. With the
+state z = (q, v, a), the controls u and generalised forces f, a step of MuJoCo is the map z_{t+1} =
+F(z_t, u_t, f_t; p) with the model parameters p. Along one motion
 
     A_t = dF/dz,   B_t = dF/df,   C_t = dF/du                                                  (1)
 
-are difference quotients, taken in all steps at once: a step of every lane of a batch, each lane at
-another instant. A change with forces df, controls du or numbers p + dp then moves the motion by
+are difference quotients, computed for all steps at once: each batch element makes a step from
+another sample time. A change with forces df, controls du or parameters p + dp then changes the
+motion by
 
     dz_{t+1} = A_t dz_t + B_t (df_t + M_t da_t) + C_t du_t                                     (2)
 
-with da_t what other numbers change about the acceleration at the same state, and M_t the inertia
+with the change da_t of the acceleration at the same state by the changed parameters, and the
+inertia matrix M_t
 
 (the tangent or variational equations; J. Guckenheimer, P. Holmes, Nonlinear Oscillations, 1983,
-section 1.3). What effects exert is asked along the motion, all instants at once. Readings move
-likewise, with their own quotients.
+section 1.3). Effect forces are evaluated along the motion, for all times at once. Changes of
+readings follow in the same way, with separate quotients.
 """
 
 from __future__ import annotations
@@ -34,23 +36,26 @@ from sims.robot.midway import Mask, Places
 from sims.system import Acting, Effect
 
 POSITION, VELOCITY, CONTROL, SHARE = 1e-6, 1e-5, 1e-5, 1e-3
-"""Differences of a position (rad or m), a velocity, a control, and a force as a share of its
-size."""
+"""Finite differences of a position (rad or m), a velocity, a control, and a force.
+
+The difference of a force is a share of its typical size.
+"""
 TOGETHER = 64
-"""Changes that go through time side by side; of more, what is held for them leaves the cache."""
+"""Maximum number of changes that are propagated together; the data of more exceed the CPU cache."""
 
 
 class Quotients(NamedTuple):
-    """The quotients of (1) and those of readings, in every step; Z states, O readings, E = D + F
-    forces.
+    """Difference quotients of (1) and of readings, for S linearisation points.
+
+    There are Z state components, O readings, and E = D + F forces.
 
     Attributes:
         states: A (S, Z, Z).
         forces: B (S, Z, E).
         controls: C (S, Z, nu).
-        read_states: (S, O, Z).
-        read_forces: (S, O, E).
-        read_controls: (S, O, nu).
+        read_states: (S, O, Z) derivatives of readings by states.
+        read_forces: (S, O, E) derivatives of readings by forces.
+        read_controls: (S, O, nu) derivatives of readings by controls.
     """
 
     states: Array
@@ -62,16 +67,16 @@ class Quotients(NamedTuple):
 
 
 class Change(NamedTuple):
-    """A change to go through time: where it acts and how much, (S,); or in numbers of the model.
+    """A perturbation to propagate: of a force or control (S,), or of model parameters.
 
     Attributes:
-        owner: number of the probe that it is of.
-        joint: whose force it is; -1 if it is none.
-        actuator: whose control it is; -1 if it is none.
-        series: (S,) forces or controls; None if numbers of the model change.
-        instant: (S,) controls as they are when each step begins.
-        forces: (N, E) what these amount to, at each instant that is looked at.
-        readings: (N, O) and what they do to readings.
+        owner: number of the effect candidate to which it belongs.
+        joint: joint of the force; -1 if it is not a force.
+        actuator: index of the control; -1 if it is not a control.
+        series: (S,) forces or controls; None if model parameters change.
+        instant: (S,) controls at the beginning of each step.
+        forces: (N, E) forces equivalent to changed parameters, at each linearisation point.
+        readings: (N, O) direct changes of readings, at each linearisation point.
     """
 
     owner: int
@@ -84,12 +89,15 @@ class Change(NamedTuple):
 
 
 class Tangent:
-    """The neighbourhood of one motion.
+    """Tangent linear model about one motion.
 
     Args:
-        at: its instants.
+        at: linearisation points of the motion.
         sizes: (E,) typical forces.
-        quotients: those of another motion nearby; taken of this one where None.
+        quotients: difference quotients of another motion nearby; computed for this one if None.
+
+    Attributes:
+        quotients: difference quotients in use.
     """
 
     def __init__(self, at: Instants, sizes: Array, quotients: Quotients | None = None) -> None:
@@ -100,22 +108,24 @@ class Tangent:
         self._share: Array = (numbers - at.numbers[at.of]) / at.every
         self._earlier, self._later = _neighbours(at.numbers, at.every)[:, at.of]
         self._base, self._read = at.reached({}, at.acting)
-        # Where commands change at other times, quotients are taken at other instants.
+        # If commands change at other times, the linearisation points differ.
         if quotients is None or quotients.states.shape[:2] != self._base.shape:
             quotients = self._quotients()
         self.quotients = quotients
-        # Accelerations and readings of the motion itself.
+        # Accelerations and readings of the unperturbed motion.
         self._still = at.accelerated(at.acting)
 
     @property
     def looks(self) -> int:
-        """Lanes that were placed so far."""
+        """Number of batch elements that were placed at linearisation points so far."""
         return self._at.seen
 
     @property
     def size(self) -> int:
-        """Numbers of a state: positions, velocities, activations, what effects remember, moves and
-        velocities of what floats.
+        """Number of state components.
+
+        They are positions, velocities, activations, hidden states of effects, and displacements and
+        velocities of floating bodies.
         """
         return int(self._base.shape[1])
 
@@ -150,31 +160,45 @@ class Tangent:
     # -- changes
 
     def by_numbers(self, owner: int, acting: Acting, change: float, bench: Bench) -> Change:
-        """The change that other numbers of the model make, as (2) has it, per `change`; `bench` has
-        the elements that they are of.
+        """Return the change by other model parameters, as in (2), per unit of `change`.
+
+        Args:
+            owner: number of the effect candidate.
+            acting: active effects including the one that changes the parameters.
+            change: size of the change.
+            bench: batch whose model has the required elements.
         """
         meant = self._meant
         with self._at.on(bench):
             accelerations, readings = self._at.accelerated(acting, meant)
-            # What drives exert no force from outside changes at once.
+            # External forces change readings of drives immediately, so the other readings are
+            # computed without these forces.
             if self._at.reads_others:
                 _, readings = self._at.accelerated(acting)
-        # What accelerates the robot by so much more is a force, and acts as one.
+        # A change of the acceleration is equivalent to a force.
         apart = (accelerations - self.accelerations[self._at.numbers]) / change
         force = np.einsum("nij,nj->ni", self._inertias, apart)
         return Change(owner, forces=force, readings=(readings - self._still[1]) / change)
 
     @cached_property
     def _meant(self) -> Array:
-        """(N, E) forces with which the acceleration at each instant is that over its step, which
-        an implicit integrator has damped, and in which the others have gone on.
+        """Forces (N, E) that convert accelerations at a state to mean accelerations over the step.
+
+        They represent the damping of an implicit integrator, and the motion of other joints within
+        the step.
         """
         apart = self.accelerations[self._at.numbers] - self._still[0]
         forces: Array = np.einsum("nij,nj->ni", self._inertias, apart)
         return forces
 
     def by_force(self, owner: int, effect: Effect, c: Array) -> list[Change]:
-        """The changes that an effect's force makes, one for each joint that it acts on."""
+        """Return the changes by an effect's force, one for each joint that it acts on.
+
+        Args:
+            owner: number of the effect candidate.
+            effect: effect with a force.
+            c: coefficients (K, 1, 1).
+        """
         force = self._at.force(effect, c)
         joints = np.flatnonzero(np.abs(force).max(axis=0) > 0)
         changes = [Change(owner, joint=int(j), series=force[:, j]) for j in joints]
@@ -188,25 +212,28 @@ class Tangent:
 
     @cached_property
     def accelerations(self) -> Array:
-        """(S, E) over each step."""
+        """Mean accelerations (S, E) over each step."""
         motion = self._motion
         result: Array = np.diff(motion.rates, axis=0)[: self._steps] / motion.step
         return result
 
-    # -- through time
+    # -- propagation over time
 
     def follow(self, changes: Sequence[Change], count: int) -> tuple[Array, Array]:
-        """Changes of states (n, S + 1, Z) and of readings (n, S, O), those of one owner together.
+        """Propagate changes along the motion, added up for each owner.
 
         Args:
-            changes: with owners from 0 to `count` - 1.
-            count: n.
+            changes: changes with owners from 0 to `count` - 1.
+            count: number of owners n.
+
+        Returns:
+            Changes of states (n, S + 1, Z) and of readings (n, S, O).
         """
         q = self.quotients
         size = q.forces.shape[1]
         steps = self._steps
         pushed, read = self.pushed(changes, count)
-        # States, forces and controls below each other, so that a step is one product.
+        # States, forces and controls are stacked, so that a step is one matrix product.
         whole = np.zeros((steps + 1, size + pushed.shape[1], count))
         whole[:-1, size:] = pushed
         step = list(np.concatenate([q.states, q.forces, q.controls], axis=2))
@@ -222,7 +249,7 @@ class Tangent:
         """Compute what changes add to forces and controls, and to readings directly.
 
         Args:
-            changes: with owners from 0 to `count` - 1.
+            changes: changes with owners from 0 to `count` - 1.
             count: number of owners n.
 
         Returns:
@@ -231,7 +258,7 @@ class Tangent:
         q = self.quotients
         joints = q.forces.shape[2]
         steps, actuators, outputs = self._steps, q.controls.shape[2], self._read.shape[1]
-        # An owner's series lie together while they are added up.
+        # The series of one owner are contiguous in memory while they are added up.
         pushed = np.zeros((joints + actuators, count, steps))
         at_once = np.zeros((actuators, count, steps)) if outputs else pushed[joints:]
         read = np.zeros((steps, outputs, count))
@@ -251,7 +278,7 @@ class Tangent:
         whole = np.ascontiguousarray(pushed.transpose(2, 0, 1))
         if outputs:
             forces = whole[:, :joints].copy()
-            # What numbers of the model change about readings is in them already.
+            # Changes of model parameters already contain their effect on readings.
             forces[:, :, self._numbered(changes, count)] = 0.0
             read += np.matmul(q.read_forces[self._at.of], forces)
             instants = np.ascontiguousarray(at_once.transpose(2, 0, 1))
@@ -260,38 +287,38 @@ class Tangent:
 
     @property
     def looked_at(self) -> Places:
-        """(S,) for each step the number of the instant whose quotients hold there."""
+        """Index of the linearisation point whose quotients apply to each step, (S,)."""
         return self._at.of
 
     @property
     def looks_at(self) -> int:
-        """Number N of instants at which quotients are taken."""
+        """Number N of linearisation points."""
         return int(self._at.numbers.size)
 
     @property
     def remembering(self) -> Sequence[int]:
-        """Numbers of the effects that have states of their own."""
+        """Numbers of the effects with hidden states."""
         return self._at.remembering
 
     @property
     def motion_readings(self) -> Array:
-        """(S, O) readings in the motion at the beginnings of steps, as the model gives them."""
+        """Readings (S, O) of the motion at the beginnings of steps, as computed by the model."""
         motion, of = self._motion, self._at.of
         with self._at.every_step():
             _, read = self._at.accelerated(self._at.acting)
-        # A step has the mean of a command, which a sensor does not show.
+        # A step applies the mean of a command, while a sensor shows its value at the beginning.
         apart = motion.instant - motion.controls
         result: Array = read + np.einsum("sou,su->so", self.quotients.read_controls[of], apart)
         return result
 
     def step_errors(self, finer: Bench) -> Array:
-        """Estimate what a step of the integrator misses, (N, Z), by Richardson's extrapolation.
+        """Estimate the discretisation error of a step, (N, Z), by Richardson extrapolation.
 
         Two steps of half the length leave half the error of one step of a method of first order (L.
         F. Richardson, 1911, doi:10.1098/rsta.1911.0009).
 
         Args:
-            finer: lanes with half the time step.
+            finer: batch with half the time step.
         """
         with self._at.on(finer):
             state, _ = self._at.reached({}, self._at.acting, steps=2)
@@ -299,7 +326,7 @@ class Tangent:
 
     @cached_property
     def defects(self) -> Array:
-        """(S, Z) by how much the motion misses the model's step from each of its states."""
+        """Differences (S, Z) between the motion and the model's step from each of its states."""
         motion, joints = self._motion, self._motion.x.shape[1]
         base, _ = self._every_step
         result = np.zeros_like(base)
@@ -307,14 +334,14 @@ class Tangent:
         result[:, joints : 2 * joints] = motion.v[1:] - base[:, joints : 2 * joints]
         moves = motion.afloat.rate.shape[1]
         if moves:
-            # Moves are counted from the motion itself.
+            # Displacements are relative to the motion itself.
             result[:, -2 * moves : -moves] = -base[:, -2 * moves : -moves]
             result[:, -moves:] = motion.afloat.rate[1:] - base[:, -moves:]
         return result
 
     @property
     def limited_forces(self) -> Array:
-        """(S, K) the forces that the limits of stiff servos limit, in each step."""
+        """Forces (S, K) with limits at stiff servos, in each step."""
         return self._every_step[1]
 
     @cached_property
@@ -324,8 +351,10 @@ class Tangent:
             return self._at.reached({}, self._at.acting)
 
     def _between(self, values: Array) -> Array:
-        """(S, k) of values (N, k) at the instants that are looked at, linear from one to the next
-        while a command holds, and beyond the last one as before it.
+        """Interpolate values (N, k) at linearisation points to all steps, (S, k).
+
+        Values are linear between points while a command is constant, and are extrapolated after the
+        last point.
         """
         slope = values[self._later] - values[self._earlier]
         result: Array = values[self._at.of] + self._share[:, None] * slope
@@ -333,14 +362,16 @@ class Tangent:
 
     @staticmethod
     def _numbered(changes: Sequence[Change], count: int) -> Mask:
-        """(n,) which owners change numbers of the model."""
+        """Return which owners (n,) change model parameters."""
         numbered = np.zeros(count, dtype=bool)
         numbered[[change.owner for change in changes if change.forces is not None]] = True
         return numbered
 
     def begun(self) -> tuple[Array, Array]:
-        """Changes by the initial state, (2 D, S + 1, Z) and (2 D, S, O): one for each position and
-        velocity.
+        """Compute the responses to each initial position and velocity.
+
+        Returns:
+            Changes of states (2 D, S + 1, Z) and of readings (2 D, S, O).
         """
         size = 2 * self._motion.x.shape[1]
         q = self.quotients
@@ -354,9 +385,14 @@ class Tangent:
 
 
 def _neighbours(looks: Places, every: int) -> Places:
-    """(2, N) for each instant two that are `every` steps apart, over which values are linear: it
-    and the next one, or the one before and it where a command changes in between; itself twice
-    where neither is.
+    """Find the pairs of linearisation points for interpolation, (2, N).
+
+    A pair is `every` steps apart: a point and the next one, or the previous one and the point if a
+    command changes in between. If neither exists, the point itself is given twice.
+
+    Args:
+        looks: (N,) steps of the linearisation points.
+        every: regular number of steps between two points.
     """
     numbers = np.arange(looks.size)
     after = np.append(np.diff(looks) == every, False)

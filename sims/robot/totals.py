@@ -1,6 +1,4 @@
-"""The number of the model file that a coefficient changes: what the file states, and the total with
-the coefficient in it.
-"""
+"""Values of model-file numbers that coefficients change, before and after the change."""
 
 from __future__ import annotations
 
@@ -16,7 +14,13 @@ from sims.system import Effect
 
 
 class Total(NamedTuple):
-    """A number of the model file before and after, and its unit."""
+    """A number of the model file before and after the effects are applied.
+
+    Attributes:
+        stated: value in the model file.
+        total: value with the coefficients applied.
+        unit: unit of both.
+    """
 
     stated: float
     total: float
@@ -24,7 +28,10 @@ class Total(NamedTuple):
 
 
 Read = Callable[[Fields, Robot, str], Sequence[float]]
-"""The numbers that an effect's coefficients change, in their order: of the fields, at a place."""
+"""Function that reads the numbers that an effect's coefficients change, in their order.
+
+It takes the model fields, the robot and the place.
+"""
 
 
 def _joint(field: str, *index: int) -> Read:
@@ -40,7 +47,7 @@ def _servo(term: int) -> Read:
 
 
 def _strength(f: Fields, robot: Robot, place: str) -> Sequence[float]:  # noqa: ARG001
-    """Gravity along the direction that the file states."""
+    """Return the component of gravity along the direction that the file specifies."""
     stated = robot.compiled.opt.gravity
     return [float(f["opt.gravity"][0] @ stated / max(np.linalg.norm(stated), 1e-300))]
 
@@ -52,7 +59,13 @@ def _limit(f: Fields, robot: Robot, place: str) -> Sequence[float]:
 
 
 class Reading(NamedTuple):
-    """How a total is read, and its units on a hinge and on a slide; empty for the coefficient's."""
+    """How a number is read from the model fields, and its unit.
+
+    Attributes:
+        read: function that reads the numbers.
+        hinge: unit at a hinge; the unit of the coefficient if empty.
+        slide: unit at a slide; the unit at a hinge if empty.
+    """
 
     read: Read
     hinge: str = ""
@@ -71,7 +84,7 @@ _TOTALS: Mapping[str, Reading] = {
     "actuator.damping": Reading(_servo(2), "N*m*s/rad", "N*s/m"),
     "mass.scale": Reading(lambda f, r, place: [f["body_mass"][0, r.body(place).id]], "kg"),
     "mass.offset": Reading(lambda f, r, place: f["body_ipos"][0, r.body(place).id]),
-    # Of three principal moments the largest.
+    # The largest of the three principal moments represents the tensor.
     "inertia.scale": Reading(
         lambda f, r, place: [np.max(f["body_inertia"][0, r.body(place).id])], "kg*m^2"
     ),
@@ -81,14 +94,21 @@ _TOTALS: Mapping[str, Reading] = {
 
 
 Fitted = Sequence[tuple[type[Effect], Sequence[float]]]
-"""Effects at one place each, or of the world, with their coefficients."""
+"""Effects, each at one place or of the world, with their coefficients."""
 
 
 def totals(robot: Robot, fitted: Fitted) -> list[list[Total | None]]:
-    """Return what becomes of the numbers of the model file when all effects are in it, by effect
-    and coefficient; None where the file states no such number.
+    """Return the numbers of the model file before and after all effects are applied.
 
-    The mass and the inertia of one body may both be wrong: a total has what all effects make of it.
+    Several effects may change one number, such as the mass and the inertia of one body; a total
+    includes all of them.
+
+    Args:
+        robot: robot with the model file.
+        fitted: effects with their coefficients.
+
+    Returns:
+        For each effect, one entry per coefficient; None if the file has no such number.
     """
     stated, after = fields(robot.compiled), fields(robot.compiled)
     for effect, values in fitted:
@@ -105,7 +125,7 @@ def _name(effect: type[Effect]) -> str:
 def _totals(
     robot: Robot, effect: type[Effect], count: int, stated: Fields, after: Fields
 ) -> list[Total | None]:
-    """The totals of one effect."""
+    """Return the totals of one effect."""
     if _name(effect) not in _TOTALS:
         return [None] * count
     reading = _TOTALS[_name(effect)]
@@ -119,7 +139,7 @@ def _totals(
 
 
 def _slides(robot: Robot, effect: type[Effect]) -> bool:
-    """Whether an effect acts at an actuator of a joint that slides."""
+    """Return whether an effect acts at an actuator of a slide joint."""
     if effect.at != "actuator":
         return False
     joint = robot.actuator(effect.place).joint

@@ -1,4 +1,4 @@
-"""What a URDF says, made fit for MuJoCo: what it does not read is left out, slips are mended."""
+"""Prepare a URDF for MuJoCo: remove elements that MuJoCo does not read, and repair mistakes."""
 
 from __future__ import annotations
 
@@ -17,26 +17,33 @@ from sims.robot.words import listed
 from sims.robot.xmlfile import Files, children, written
 
 READ = ("link", "joint", "mujoco")
-"""What is read of a robot."""
+"""Child elements of a robot that are read."""
 SEEN = ("material", "visual")
-"""What is only seen."""
+"""Elements that are only visual."""
 SINGLE = ("revolute", "continuous", "prismatic")
 MOVING = (*SINGLE, "floating", "planar", "spherical")
 KINDS = ("fixed", *MOVING)
 WORLD = "world"
 """Name of the link that is the fixed world by a convention of many files."""
 RIGID = (1e-4, 1.0)
-"""`solref` of a rigid relation: MuJoCo raises the time constant, in s, to two time steps."""
+"""Parameter `solref` of a rigid mimic relation.
+
+MuJoCo raises its time constant, in s, to two time steps.
+"""
 
 
 def mended(files: Files, root: Element) -> list[str]:
-    """Mend a URDF in its place.
+    """Repair a URDF in place.
+
+    Args:
+        files: reader of the model file.
+        root: root element of the URDF.
 
     Returns:
-        One line for each kind of thing that was mended or left out.
+        Notes, one line for each kind of repair or omission.
 
     Raises:
-        InputError: it is no tree of links, or nothing in it moves.
+        InputError: the links do not form a tree, or nothing in it moves.
     """
     _no_macros(files, root)
     links, joints = _links(files, root), children(root, "joint")
@@ -66,7 +73,7 @@ def _no_macros(files: Files, root: Element) -> None:
 
 
 def _unread(root: Element) -> list[str]:
-    """Take away what MuJoCo does not read."""
+    """Remove elements that MuJoCo does not read."""
     tags = sorted({child.tag for child in root if child.tag not in (*READ, *SEEN)})
     root[:] = [child for child in root if child.tag in READ]
     unread = listed([f"<{tag}>" for tag in tags])
@@ -88,8 +95,9 @@ def _links(files: Files, root: Element) -> dict[str, Element]:
 def _with_world(
     files: Files, root: Element, links: dict[str, Element], joints: Sequence[Element]
 ) -> list[str]:
-    """Add the link `world` where joints hang on it and the file does not state it, as simulators
-    that have a link of this name read it.
+    """Add the link `world` if joints refer to it and the file does not define it.
+
+    Simulators with a link of this name read such a file in this way.
     """
     if WORLD in links or not any(_end(files, joint, "parent") == WORLD for joint in joints):
         return []
@@ -98,7 +106,7 @@ def _with_world(
 
 
 def _named(files: Files, joints: Sequence[Element]) -> list[str]:
-    """See that each joint has a name of its own."""
+    """Give each joint a unique name."""
     seen: set[str] = set()
     notes = []
     for joint in joints:
@@ -116,7 +124,7 @@ def _named(files: Files, joints: Sequence[Element]) -> list[str]:
 
 
 def _end(files: Files, joint: Element, tag: str) -> str:
-    """The name of a joint's parent or child."""
+    """Return the name of a joint's parent or child link."""
     ends = children(joint, tag)
     name = ends[0].get("link") if ends else None
     if not name:
@@ -128,7 +136,7 @@ def _end(files: Files, joint: Element, tag: str) -> str:
 def _joined(
     files: Files, links: Mapping[str, Element], joints: Sequence[Element]
 ) -> dict[str, tuple[str, Element]]:
-    """By link, the one that carries it and the joint between them; what is no tree is refused."""
+    """Return the parent link and the joint of each link; raise an error if links form no tree."""
     above: dict[str, tuple[str, Element]] = {}
     for joint in joints:
         label, kind = cut(joint.get("name") or ""), joint.get("type") or ""
@@ -151,7 +159,7 @@ def _joined(
 
 
 def _held(above: Mapping[str, tuple[str, Element]], name: str) -> bool:
-    """Whether a link is fused to the world."""
+    """Return whether a link is fused to the world."""
     while name in above:
         name, joint = above[name]
         if joint.get("type") != "fixed":
@@ -160,7 +168,7 @@ def _held(above: Mapping[str, tuple[str, Element]], name: str) -> bool:
 
 
 def _compiler(root: Element) -> Element:
-    """The settings of MuJoCo's compiler; those of files and of what is seen are dealt with here."""
+    """Return the settings element of MuJoCo's compiler, which is created if missing."""
     blocks = children(root, "mujoco")
     block = blocks[0] if blocks else SubElement(root, "mujoco")
     found = children(block, "compiler")
@@ -168,7 +176,7 @@ def _compiler(root: Element) -> Element:
 
 
 def _checked(files: Files, root: Element) -> None:
-    """Refuse settings for MuJoCo that it does not know: in a URDF it passes over them."""
+    """Raise an error for unknown MuJoCo settings, which MuJoCo ignores in a URDF."""
     import mujoco
 
     for child in children(root, "mujoco"):
@@ -183,7 +191,7 @@ def _checked(files: Files, root: Element) -> None:
 
 
 def _once(parts: Sequence[Element]) -> list[str]:
-    """Keep the first of what stands twice in a link or a joint."""
+    """Remove repeated elements in a link or a joint, except for the first of each kind."""
     twice = []
     for part in parts:
         seen: set[str] = set()
@@ -196,7 +204,7 @@ def _once(parts: Sequence[Element]) -> list[str]:
 
 
 def speeds(root: Element) -> dict[str, float]:
-    """Of joints, the fastest that they may go, rad/s or m/s; of some it is not said."""
+    """Return the velocity limits of joints, rad/s or m/s, where the file specifies them."""
     found = {}
     for joint in children(root, "joint"):
         for limit in children(joint, "limit"):
@@ -235,8 +243,9 @@ def _limits(joints: Sequence[Element]) -> list[str]:
 
 
 def stiffen_mimics(spec: Any) -> None:
-    """Let mimic joints follow as stiffly as MuJoCo allows: URDF states a rigid relation, and
-    MuJoCo's default equality follows it with a delay of 20 ms.
+    """Make mimic joints follow as stiffly as MuJoCo allows.
+
+    URDF specifies a rigid relation, and MuJoCo's default equality follows it with a delay of 20 ms.
 
     Args:
         spec: mujoco.MjSpec of a URDF, whose only equalities are those of mimic joints.

@@ -1,10 +1,12 @@
-"""Causes written into a URDF: what its elements can say, each with a comment.
+"""Write causes into a URDF, as far as its elements can express them, each with a comment.
 
-URDF has a linear damping and a dry friction of a joint, and the inertial of a link. A body that
-MuJoCo made of several links on fixed joints is changed in each of them:
+URDF specifies linear damping and dry friction of a joint, and the inertial of a link. A body that
+MuJoCo fused from several links on fixed joints is changed in each of them:
 
-* (1) mass and tensor times 1 + c of each link: the body's mass, tensor and centre follow
-* (2) each centre of mass moved by R' c, R the link's axes in the body's: the body's moves by c
+* (1) Mass and inertia tensor of each link are multiplied by 1 + c; the mass, tensor and centre of
+  mass of the body follow.
+* (2) Each centre of mass is moved by R' c, with the link's axes R in the body frame; the body's
+  centre of mass moves by c.
 """
 
 from __future__ import annotations
@@ -23,14 +25,14 @@ _TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class UrdfWriter:
-    """Writes causes into a text of URDF.
+    """Writer of causes into the text of a URDF.
 
     Args:
-        robot: what was read.
-        recording: to which the causes were fitted.
+        robot: robot as read from its model file.
+        recording: title of the recording to which the causes were fitted.
 
     Raises:
-        UnfitError: the file is no XML in UTF-8.
+        UnfitError: the file is not XML in UTF-8.
     """
 
     def __init__(self, robot: Robot, recording: str) -> None:
@@ -41,7 +43,7 @@ class UrdfWriter:
         self.joints = {tag.says("name"): tag for tag in top if tag.name == "joint"}
 
     def write(self, cause: Cause) -> str | None:
-        """Write a cause; why it cannot be, where it cannot."""
+        """Write a cause; return the reason if a URDF cannot express it, else None."""
         known: Mapping[str, Callable[[Cause], str | None]] = {
             "drag.linear": lambda cause: self._dynamics(cause, "damping"),
             "friction.coulomb": lambda cause: self._dynamics(cause, "friction"),
@@ -54,10 +56,10 @@ class UrdfWriter:
         return known[cause.effect](cause)
 
     def text(self, said: list[str]) -> str:
-        """The file with all changes.
+        """Return the file with all changes.
 
         Args:
-            said: lines that stand at its top.
+            said: lines for the comment at the top of the file.
         """
         fitted = f", with what was found in {self.recording}" if self.recording else ""
         comment = heading([f"{self.robot.path.name}{fitted}", *said])
@@ -79,7 +81,7 @@ class UrdfWriter:
         return None
 
     def _insert(self, joint: Tag, name: str, attribute: str, value: str) -> None:
-        """A child of a joint that is not there yet, or more of one that is new."""
+        """Insert a child element into a joint, or add an attribute to a child inserted before."""
         begin = f"<{name} "
         for i, (comments, element) in enumerate(joint.within):
             if element.startswith(begin):
@@ -94,10 +96,10 @@ class UrdfWriter:
         tag.before.append(cause.told(self.recording))
 
     def _inertials(self, cause: Cause) -> list[tuple[str, Tag]] | None:
-        """The links of a body that have a mass, with their inertials; None where the mass of a link
-        follows from its shapes, or no link has one.
+        """Return the links of a body that have a mass, with their inertials.
 
-        A link without mass, as a frame that carries others on fixed joints, adds nothing.
+        A link without mass, such as a frame that carries others on fixed joints, adds nothing. The
+        result is None if the mass of a link follows from its shapes, or if no link has a mass.
         """
         body = self.robot.body(cause.place)
         found = []
@@ -147,7 +149,7 @@ class UrdfWriter:
         return None
 
     def _axes(self, link: str, body: str) -> Array:
-        """(3, 3) a link's axes in those of the body into which it is fused."""
+        """Return the axes (3, 3) of a link in the frame of the body into which it is fused."""
         axes = np.eye(3)
         while link != body:
             (joint,) = [tag for tag in self.joints.values() if _names(tag, "child") == link]
@@ -162,13 +164,13 @@ def _child(tag: Tag, name: str) -> Tag | None:
 
 
 def _names(joint: Tag, end: str) -> str:
-    """The link at an end of a joint."""
+    """Return the link at one end of a joint."""
     found = _child(joint, end)
     return (found.says("link") or "") if found else ""
 
 
 def _has_mass(inertial: Tag) -> bool:
-    """Whether an inertial states a mass or a moment of inertia other than zero."""
+    """Return whether an inertial specifies a nonzero mass or moment of inertia."""
     stated = ((_child(inertial, "mass"), ("value",)), (_child(inertial, "inertia"), _TENSOR))
     return any(float(tag.says(key) or 0.0) for tag, keys in stated if tag for key in keys)
 
@@ -182,12 +184,12 @@ def _scale(inertial: Tag, name: str, attributes: tuple[str, ...], factor: float)
 
 
 def _vector(text: str | None) -> Array:
-    """(3,) numbers; zeros where there are none."""
+    """Parse a vector (3,); zeros for a missing text."""
     return np.array([float(word) for word in text.split()]) if text else np.zeros(3)
 
 
 def _turn(rpy: Array) -> Array:
-    """(3, 3) axes turned about fixed x, y and z, one after the other, as URDF says."""
+    """Return the axes (3, 3) rotated about fixed x, y and z in turn, as URDF defines ``rpy``."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     return np.array(
         [

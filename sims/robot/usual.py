@@ -1,5 +1,6 @@
-"""What a robot is usually told and shows, where the user does not say: commands about its pose that
-move every joint, within the limits of controls and joints.
+"""Default channels and excitation of a robot, for recordings without specified ones.
+
+The commands move every joint about its reference pose, within the limits of controls and joints.
 """
 
 from __future__ import annotations
@@ -15,26 +16,31 @@ from sims.robot.scales import scales
 from sims.system import UsualRecording
 
 SWING = {"hinge": 0.4, "slide": 0.1}
-"""rad or m that a joint is moved to either side, where its range allows."""
+"""Amplitude of a joint's motion, in rad or m, by joint kind, if its range allows it."""
 SHARE = 0.25
-"""Of a range, that is swung through at most."""
+"""Maximum amplitude of a joint's motion, as a share of its range."""
 ROOM = 0.8
-"""Of what is left of a joint's range to the nearer side."""
+"""Maximum amplitude, as a share of the distance from the pose to the nearer joint limit."""
 HEAVY = 0.5
-"""Of the largest force of gravity on a joint, that it is swung with at least."""
+"""Minimum force amplitude, as a share of the typical force of the joint."""
 SLOW, FAST = 0.3, 2.0
-"""Hz, the lowest and the highest frequency of a command."""
+"""Lowest and highest frequency of a command, in Hz."""
 MIDDLE = 2.0 * np.pi * np.sqrt(SLOW * FAST)
-"""rad/s, between them."""
+"""Geometric mean of the lowest and highest frequency, in rad/s."""
 SECONDS = 4.0
-"""That commands are tried for."""
+"""Duration of the trial simulation of commands, in seconds."""
 TRIES = 6
-"""Sizes of commands that are tried, each half the one before."""
+"""Number of command amplitudes that are tried; each is half the previous one."""
 
 
 class Command(NamedTuple):
-    """A command: the input's name, what it swings about, how far, and its address, that of a
-    control or of a generalised force.
+    """Excitation command of one input.
+
+    Attributes:
+        name: name of the input.
+        centre: mean value.
+        size: amplitude.
+        address: index of the control, or of the generalised force.
     """
 
     name: str
@@ -43,19 +49,20 @@ class Command(NamedTuple):
     address: int
 
     def text(self, share: float) -> str:
-        """As a signal, with so much of its size."""
+        """Format as a signal text, with the amplitude multiplied by a share."""
         swing = f"multisine:{share * self.size:.4g}:{SLOW:g}:{FAST:g}"
         return f"{self.centre:.6g} + {swing}" if self.centre else swing
 
 
 class Usual:
-    """The usual recording of a robot's system, made when it is first asked for."""
+    """Default recording of a robot's system, created on first access (a descriptor)."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = f"_made_{name}"
 
     def __get__(self, _instance: object, owner: Any) -> UsualRecording:
-        # In the class itself: what it inherits is another robot's.
+        # The value is stored in the class itself, since an inherited value belongs to another
+        # robot.
         if self._name not in vars(owner):
             setattr(owner, self._name, usual(owner.robot))
         made: UsualRecording = vars(owner)[self._name]
@@ -63,16 +70,17 @@ class Usual:
 
 
 def usual(robot: Robot) -> UsualRecording:
-    """Every joint's position, at commands that swing each joint about the pose of the file.
+    """Make the default recording: all joint positions, with commands that move each joint.
 
-    A servo is told positions or velocities; a motor gets the force that holds the pose and, beside
-    it, one that would swing a free joint. A robot without actuators is pushed at its joints.
+    The commands oscillate about the reference pose of the file. A servo receives positions or
+    velocities. A motor receives the force that holds the pose, plus a force that would move a free
+    joint. A robot without actuators is moved by forces at its joints.
     """
     joints = [joint for joint in robot.joints if joint.single]
     commands = _commands(robot, joints)
     shares = [0.5**k for k in range(TRIES)]
     with quiet():
-        # What leaves its range at any size is not driven out by its commands.
+        # If joints leave their ranges at any amplitude, their commands are not the cause.
         share = next((s for s in shares if _stays(robot, joints, commands, s)), 1.0)
     observe = tuple(f"q.{joint.name}" for joint in joints)
     return UsualRecording(observe=observe, inputs={c.name: c.text(share) for c in commands})
@@ -93,7 +101,7 @@ def _commands(robot: Robot, joints: Sequence[Joint]) -> list[Command]:
 
 
 def _at_pose(robot: Robot, joints: Sequence[Joint]) -> tuple[dict[str, float], dict[str, float]]:
-    """By joint the force that holds the pose of the file, and one that swings the joint."""
+    """Return the holding force of each joint in the reference pose, and a force amplitude."""
     import mujoco
 
     model = robot.compiled
@@ -105,14 +113,19 @@ def _at_pose(robot: Robot, joints: Sequence[Joint]) -> tuple[dict[str, float], d
     for number, joint in enumerate(joints):
         holding[joint.name] = float(bias[joint.velocity])
         swing = _swing(joint, float(model.qpos0[joint.position]))
-        # Of a free joint, in the middle of the frequencies; gravity holds others back.
+        # The inertia force of a free joint at the centre frequency; gravity restrains other joints.
         free = sizes.inertia[number] * MIDDLE**2 * swing
         forces[joint.name] = float(max(free, HEAVY * sizes.force[number]))
     return holding, forces
 
 
 def _swing(joint: Joint, start: float) -> float:
-    """How far a joint is to move to either side."""
+    """Return the amplitude of a joint's motion, in rad or m.
+
+    Args:
+        joint: joint to move.
+        start: position about which it moves, in rad or m.
+    """
     swing = SWING[joint.kind]
     if joint.range is None:
         return swing
@@ -124,7 +137,7 @@ def _swing(joint: Joint, start: float) -> float:
 def _command(
     robot: Robot, actuator: Actuator, joint: Joint, holding: float, force: float
 ) -> Command:
-    """The command of an actuator."""
+    """Make the command of an actuator."""
     model = robot.compiled
     start = float(model.qpos0[joint.position])
     swing = _swing(joint, start)
@@ -140,7 +153,7 @@ def _command(
         low, high = actuator.range
         centre = min(max(centre, low), high)
         room = min(centre - low, high - centre)
-        # At the end of what it can be told it is told to come back from there.
+        # A set point at the end of the control range is moved to its middle.
         if room < SHARE * size:
             centre = 0.5 * (low + high)
             room = 0.5 * (high - low)
@@ -151,7 +164,7 @@ def _command(
 def _stays(
     robot: Robot, joints: Sequence[Joint], commands: Sequence[Command], share: float
 ) -> bool:
-    """Whether no joint leaves its range at so much of the commands, all of them in phase."""
+    """Return whether no joint leaves its range under commands of reduced amplitude in phase."""
     import mujoco
 
     model = robot.compiled
@@ -159,7 +172,7 @@ def _stays(
     limited = [joint for joint in joints if joint.range is not None]
     places = [joint.position for joint in limited]
     low, high = np.array([joint.range for joint in limited]).reshape(-1, 2).T
-    # Where it begins it may be: a file's pose need not heed the file's limits.
+    # The reference pose of a file may violate the file's limits, so limits include it.
     low, high = np.minimum(low, model.qpos0[places]), np.maximum(high, model.qpos0[places])
     told: Any = data.ctrl if any(c.name.startswith("u.") for c in commands) else data.qfrc_applied
     addresses = [c.address for c in commands]

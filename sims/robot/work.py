@@ -1,4 +1,4 @@
-"""Lanes of a robot on their way: where they begin, what they are given, what is made of them."""
+"""Batches of robot runs: initial states, inputs and results of their batch elements."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ from sims.system import Acting, Sensor
 Number = TypeVar("Number", bound=np.generic)
 
 BEYOND, LATE = 1.1, 0.2
-"""How far beyond its end a run is simulated at most where sensors are early: times its length, and
-seconds.
+"""Maximum simulated time after the last time stamp if sensors sample early.
+
+A run is simulated for at most `BEYOND` times its duration plus `LATE` seconds.
 """
 
 
 class Work(NamedTuple):
-    """Lanes of one run.
+    """Batch elements of one run.
 
     Attributes:
-        scenario: theirs.
-        commands: its inputs (T,) by name.
+        scenario: scenario of the run.
+        commands: inputs (T,) by name.
         acting: effects at one place each, with coefficients (K, n, 1).
-        x, v: (n, D) initial positions and velocities.
+        x: (n, D) initial positions.
+        v: (n, D) initial velocities.
     """
 
     scenario: Scenario
@@ -40,26 +42,34 @@ class Work(NamedTuple):
 
     @property
     def times(self) -> Array:
-        """(T,) of samples, seconds since the start."""
+        """Sample times (T,) in seconds since the start."""
         result: Array = self.scenario.times - self.scenario.times[0]
         return result
 
 
 def instants(work: Work) -> Array:
-    """The last instants at which something is read in the lanes of a run, seconds since the start:
-    by a clock that runs slow the world goes on beyond the last stamp.
+    """Return the last time, (1,), at which a sensor is read in a run, in seconds since the start.
+
+    With a slow clock the true time passes the last time stamp.
     """
     end = work.times[-1:]
     latest = float(end[0])
     for effect, c in work.acting:
         if isinstance(effect, Sensor):
             latest = max(latest, float(np.max(effect.times(c, np.broadcast_to(end, c[0].shape)))))
-    # What a fit tries far from all that can be shall not cost a thousand steps.
+    # Implausible values that a fit tries must not cost thousands of steps.
     return np.array([min(latest, BEYOND * float(end[0]) + LATE)])
 
 
 class Start(NamedTuple):
-    """Where n lanes begin, (n, D) each, what acts on them, and where what floats begins."""
+    """Initial states of n batch elements, and the effects active on them.
+
+    Attributes:
+        x: (n, D) initial positions.
+        v: (n, D) initial velocities.
+        acting: effects with their coefficients (K, n, 1).
+        afloat: initial poses and velocities of floating bodies.
+    """
 
     x: Array
     v: Array
@@ -68,15 +78,15 @@ class Start(NamedTuple):
 
 
 class Given(NamedTuple):
-    """What n lanes are given over S steps, known beforehand.
+    """Precomputed inputs of n batch elements over S steps.
 
     Attributes:
-        controls: (n, S, nu).
-        forces: (n, S, nv) generalised.
-        felt: inputs, (n, S) by name; behind a filter before an actuator, its activation.
-        instant: controls as they are when each step begins.
-        activations: (n, na) of actuators when the first step begins.
-        off: (n, S, K) which actuators are switched off.
+        controls: (n, S, nu) mean controls over each step.
+        forces: (n, S, nv) generalised forces.
+        felt: applied inputs (n, S) by name; after an activation filter, the activation.
+        instant: (n, S, nu) controls at the beginning of each step.
+        activations: (n, na) initial activations of the actuators.
+        off: (n, S, K) whether each actuator is switched off.
     """
 
     controls: Array
@@ -88,7 +98,7 @@ class Given(NamedTuple):
 
     @classmethod
     def of(cls, parts: Sequence[Given]) -> Given:
-        """Lanes of several runs; shorter ones are given their last over and over."""
+        """Concatenate the inputs of several runs; shorter runs repeat their last inputs."""
         if len(parts) == 1:
             return parts[0]
         steps = max(part.controls.shape[1] for part in parts)
@@ -104,7 +114,7 @@ class Given(NamedTuple):
 
 
 def _lasting(values: NDArray[Number], steps: int) -> NDArray[Number]:
-    """(n, S', ...) drawn out to so many steps by their last."""
+    """Extend values (n, S', ...) to S steps by repeating the last one."""
     more = steps - values.shape[1]
     if not more:
         return values
@@ -112,7 +122,15 @@ def _lasting(values: NDArray[Number], steps: int) -> NDArray[Number]:
 
 
 def by_run(runs: Runs, lanes: Places) -> list[tuple[int, Places]]:
-    """Lanes that lie together by their runs."""
+    """Group consecutive batch elements by their runs.
+
+    Args:
+        runs: runs of all batch elements.
+        lanes: indices of the batch elements.
+
+    Returns:
+        For each group, the number of the run and the indices of its batch elements.
+    """
     if not lanes.size:
         return []
     borders = np.flatnonzero(np.diff(runs.of[lanes])) + 1
@@ -120,13 +138,14 @@ def by_run(runs: Runs, lanes: Places) -> list[tuple[int, Places]]:
 
 
 class Made(NamedTuple):
-    """What MuJoCo made of n lanes.
+    """Simulation results of n batch elements.
 
     Attributes:
-        x, v: (n, S + 1, D) at the beginning and after every step.
-        fields: what MuJoCo's data had in each step, (n, S, ...) by name.
-        begun: (n, na) activations at the beginning.
-        failed: (n,) which lanes did.
+        x: (n, S + 1, D) positions at the beginning and after every step.
+        v: (n, S + 1, D) velocities at the beginning and after every step.
+        fields: recorded fields of MuJoCo's data in each step, (n, S, ...) by name.
+        begun: (n, na) initial activations.
+        failed: (n,) whether the simulation failed.
         series: positions and velocities (n, S + 1, H) of joints in series with others.
     """
 
@@ -138,7 +157,7 @@ class Made(NamedTuple):
     series: tuple[Array, Array]
 
     def of(self, lanes: slice) -> Made:
-        """Some of the lanes."""
+        """Return the results of some batch elements."""
         fields = {name: values[lanes] for name, values in self.fields.items()}
         series = self.series[0][lanes], self.series[1][lanes]
         rest = self.begun[lanes], self.failed[lanes], series

@@ -1,8 +1,8 @@
-"""The result of explain, back in the robot's own file.
+"""Write the causes found by explain back into the robot's own model file.
 
-An MJCF stays the file that its author wrote: attributes change, each with a comment beside it that
-says why. Where that is impossible (elements that stand for several, a URDF) MuJoCo writes the
-model, with the same comments.
+An MJCF keeps its author's text: only attributes change, each with a comment that states the reason.
+Where this is impossible (elements that generate several elements, a URDF), MuJoCo writes the model,
+with the same comments.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Causes = Mapping[str, Mapping[str, Number]]
 """Coefficients by ``effect@place``, ``effect@*`` or ``effect``."""
 
 SAME = 1e-12
-"""Relative difference of two numbers of a compiled model that is rounding."""
+"""Relative difference between numbers of a compiled model that counts as rounding."""
 
 _SOFT_IN_URDF = (
     "friction.coulomb: a URDF cannot say that dry friction is stiff, and MuJoCo reads it in its "
@@ -40,13 +40,13 @@ _SOFT_IN_URDF = (
 
 @dataclass(frozen=True)
 class Written:
-    """A robot's file with causes in it.
+    """Model files of a robot with causes applied.
 
     Attributes:
         xml: an MJCF that MuJoCo loads.
-        urdf: a URDF, where the robot came from one.
-        said: what the files do not hold, and what is to be known of what they hold; a line each.
-        applied: the model that `xml` states.
+        urdf: a URDF, if the robot was read from one.
+        said: notes about causes that the files cannot express, and about the written ones.
+        applied: the model that `xml` describes.
     """
 
     xml: str | None
@@ -56,15 +56,15 @@ class Written:
 
 
 def written(robot: Robot, causes: Causes, recording: str = "") -> Written:
-    """The robot's own file with causes in it.
+    """Write causes into the robot's own model file.
 
     Args:
-        robot: what was read.
+        robot: robot as read from its model file.
         causes: coefficients by ``effect@place``, ``effect@*`` or ``effect``.
-        recording: its title; comments name it.
+        recording: title of the recording, for comments.
 
     Raises:
-        InputError: a place that the robot does not have.
+        InputError: the robot has no place of that name.
     """
     applied = apply(robot, causes, recording)
     said = list(applied.said)
@@ -83,8 +83,13 @@ def written(robot: Robot, causes: Causes, recording: str = "") -> Written:
 
 
 def with_series(applied: Applied) -> bytes:
-    """The text of a robot's file, with the joints that are in series with its own, and tendons of
-    drives that are coupled.
+    """Render the model file with joints in series with its own, and tendons of coupled drives.
+
+    Args:
+        applied: model with the causes applied.
+
+    Raises:
+        UnfitError: the text does not contain a required joint or actuator.
     """
     robot = applied.robot
     text = robot.path.read_bytes()
@@ -103,7 +108,7 @@ def with_series(applied: Applied) -> bytes:
 
 
 def _couple(document: Document, applied: Applied) -> None:
-    """State tendons, and let actuators drive them in place of their joints."""
+    """Add tendons, and let actuators drive them instead of their joints."""
     robot, model = applied.robot, applied.model
     tags = [child for tag in document.under("actuator") for child in document.children(tag)]
     if len(tags) != len(robot.actuators):
@@ -124,7 +129,7 @@ def _couple(document: Document, applied: Applied) -> None:
 
 
 def _joint(second: Any) -> str:
-    """A joint in series as an element; whatever the file's defaults say is said of others."""
+    """Render a joint in series as an element that does not depend on the file's default classes."""
     kind = "slide" if str(second.type).endswith("SLIDE") else "hinge"
     plays = str(second.limited).endswith("TRUE")
     attributes = {
@@ -145,7 +150,7 @@ def _joint(second: Any) -> str:
 
 
 def _urdf(robot: Robot, causes: Causes, recording: str, said: list[str]) -> str | None:
-    """The URDF with what it can say; adds what it cannot."""
+    """Render the URDF with the causes that it can express, and add notes about all others."""
     try:
         writer = UrdfWriter(robot, recording)
     except UnfitError as unfit:
@@ -164,13 +169,13 @@ def _urdf(robot: Robot, causes: Causes, recording: str, said: list[str]) -> str 
 
 
 class Edit:
-    """Writes what is wanted into a text of MJCF.
+    """Writer of the wanted attributes into an MJCF text.
 
     Args:
-        robot: of which it is.
-        applied: what it is to compile to.
-        recording: its title.
-        text: of the file.
+        robot: robot with the text.
+        applied: model that the text should compile to.
+        recording: title of the recording.
+        text: text of the model file.
     """
 
     def __init__(self, robot: Robot, applied: Applied, recording: str, text: bytes) -> None:
@@ -179,24 +184,24 @@ class Edit:
         self.original = compiled(self._document().written())
 
     def _document(self) -> Document:
-        """The text, which finds its files from anywhere."""
+        """Parse the text, with asset folders that are valid from anywhere."""
         document = Document(self.text, self.robot.path)
         document.rooted(self.folder)
         return document
 
     def stated(self) -> str:
-        """The text with what is wanted.
+        """Return the text with all wanted attributes.
 
         Raises:
-            UnfitError: whatever is stated, it does not compile to that.
+            UnfitError: the edited text does not compile to the wanted model.
         """
-        # What carries a comment is a statement, though its numbers may be in the text already.
+        # An element with comments needs a statement even if its numbers are in the text already.
         statements = {element: Statement(element) for element in self.applied.comments}
         model = self.original
         for _ in range(ROUNDS):
             for statement in lacking(model, self.applied.wanted, CLOSE):
                 held = statements.setdefault(statement.element, Statement(statement.element))
-                # What was stated and still lacks needs all that goes with it.
+                # Attributes that were written without effect need their related attributes.
                 held.insisted = bool(held.values) or model is not self.original
                 held.values |= statement.values
             text = self._written(list(statements.values()))
@@ -217,16 +222,16 @@ class Edit:
         return document.written()
 
     def _heading(self) -> str:
-        """What the file is, and what it does not hold."""
+        """Format the comment at the top: the origin of the file, and notes."""
         fitted = f", with what was found in {self.recording}" if self.recording else ""
         return heading([f"{self.robot.path.name}{fitted}", *self.applied.said])
 
 
 def compiled(text: str) -> Any:
-    """The model of an MJCF.
+    """Compile an MJCF text.
 
     Raises:
-        UnfitError: MuJoCo refuses it.
+        UnfitError: MuJoCo rejects the text.
     """
     import mujoco
 
@@ -235,6 +240,6 @@ def compiled(text: str) -> Any:
             model = mujoco.MjSpec.from_string(text).compile()
     except ValueError as error:
         raise UnfitError(f"MuJoCo refuses it: {' '.join(str(error).split())}") from None
-    # The spec held all meshes a second time.
+    # The discarded spec held all meshes a second time.
     release_free_memory()
     return model

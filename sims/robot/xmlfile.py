@@ -1,5 +1,7 @@
-"""Model files as trees of elements: read by a parser that opens nothing by itself, with what they
-include, and written again so that a line of what is written leads back to the user's.
+"""Read model files as XML trees with a safe parser, resolve includes, and format trees as text.
+
+The parser opens no other files. Each line of the formatted text can be traced back to a line of the
+user's files.
 """
 
 from __future__ import annotations
@@ -16,24 +18,24 @@ from sims.base import InputError
 from sims.files import require_file
 
 LARGEST = 50 * 2**20
-"""Bytes of a model file with all that it includes."""
+"""Maximum size of a model file including all included files, in bytes."""
 MESH = 500 * 2**20
-"""Bytes of a mesh or a picture."""
+"""Maximum size of a mesh or an image file, in bytes."""
 DEEPEST = 400
-"""Elements within elements."""
+"""Maximum nesting depth of XML elements."""
 
 
 @dataclass
 class Files:
-    """What has been read for one model.
+    """Reader of the files of one model.
 
     Attributes:
-        path: the model file; what it includes lies relative to its folder.
-        places: by element, file and line where it stands.
-        included: files that have been included, and the model file.
-        size: bytes that have been read of them.
-        hashed: of all that has been read.
-        given: the elements that MuJoCo was given, one begun in each line.
+        path: the model file; included files are relative to its folder.
+        places: file and line of each element.
+        included: the model file and all included files.
+        size: total size of these files in bytes.
+        hashed: SHA-256 digest of everything that was read.
+        given: elements in the text given to MuJoCo, one for each line of the text.
     """
 
     path: Path
@@ -44,13 +46,14 @@ class Files:
     given: list[Element] = field(default_factory=list)
 
     def fault(self, element: Element | None, message: str) -> InputError:
-        """The error for an element of the file."""
+        """Make the error for an element of the file, with file and line."""
         place = self.places.get(element) if element is not None else None
         return InputError(f"{place or self.path}: {message}")
 
     def refused(self, said: str) -> InputError:
-        """The error for what MuJoCo says of the text that it was given, with the line in the file
-        for that in the text.
+        """Make the error for a message of MuJoCo about the text that it was given.
+
+        The line in that text is replaced by the line in the user's file.
         """
         line = re.search(r", line (\d+)", said)
         number = int(line[1]) if line else 0
@@ -58,10 +61,14 @@ class Files:
         return self.fault(element, re.sub(r", line \d+", "", said))
 
     def content(self, path: Path, most: int) -> bytes:
-        """What is in a file; its bytes enter the digest.
+        """Read a file, and add its bytes to the digest.
+
+        Args:
+            path: path of the file.
+            most: maximum size in bytes.
 
         Raises:
-            InputError: it cannot be read, or is too large.
+            InputError: the file cannot be read, or is too large.
         """
         require_file(path)
         try:
@@ -75,24 +82,28 @@ class Files:
         return data
 
     def add(self, data: bytes) -> None:
-        """Let this enter the digest."""
+        """Add bytes to the digest."""
         self.hashed.update(f"{len(data)}:".encode())
         self.hashed.update(data)
 
 
 def tree(files: Files, path: Path) -> Element:
-    """The root element of a file.
+    """Parse a file and return its root element.
+
+    Args:
+        files: reader of the model.
+        path: path of the file.
 
     Raises:
-        InputError: the file cannot be read, is too large or is no XML, or declares what an XML
-            parser would fetch or repeat (a document type, an entity).
+        InputError: the file cannot be read, is too large or is not XML, or it declares something
+            that an XML parser would fetch or repeat (a document type, an entity).
     """
     data = files.content(path, LARGEST)
     files.included.append(path.resolve())
     files.size += len(data)
     if files.size > LARGEST:
         raise InputError(f"{files.path}: with what it includes it has more than {LARGEST} bytes")
-    # What MuJoCo's parser lets pass: blank lines before the declaration, zeros after the end.
+    # Like MuJoCo's parser, accept blank lines before the declaration and zero bytes after the end.
     text = data.rstrip(b"\0").lstrip(b" \t\r\n")
     above = data[: data.find(text[:1])].count(b"\n") if text else 0
     parser = expat.ParserCreate()
@@ -106,13 +117,13 @@ def tree(files: Files, path: Path) -> Element:
         line = error.lineno + above
         wanted = "a robot's model file is MJCF or URDF"
         raise InputError(f"{path}:{line}: not well-formed XML: {what}; {wanted}") from None
-    except (ValueError, LookupError) as error:  # an encoding that does not exist
+    except (ValueError, LookupError) as error:  # The declared encoding does not exist.
         raise InputError(f"{path}: not XML: {error}") from None
     return grown.root
 
 
 class _Growing:
-    """The tree while the parser goes through the file."""
+    """XML tree under construction by a parser."""
 
     def __init__(self, files: Files, path: Path, parser: Any, above: int) -> None:
         self.files, self.path, self.parser, self.above = files, path, parser, above
@@ -130,7 +141,7 @@ class _Growing:
 
     @property
     def here(self) -> str:
-        """File and line."""
+        """File and line at the parser's position."""
         return f"{self.path}:{self.parser.CurrentLineNumber + self.above}"
 
     def begin(self, name: str, attributes: dict[str, str]) -> None:
@@ -152,8 +163,13 @@ class _Growing:
 
 
 def include(files: Files, root: Element) -> None:
-    """Put what a file includes in the place of its ``include`` elements, as MuJoCo does: names are
-    relative to the model file's folder, and no file is included twice.
+    """Replace ``include`` elements by the content of their files, as MuJoCo does.
+
+    Names are relative to the model file's folder, and no file is included twice.
+
+    Args:
+        files: reader of the model.
+        root: root element; it is changed in place.
     """
     for parent in list(root.iter()):
         if any(child.tag == "include" for child in parent):
@@ -181,7 +197,11 @@ def _with_included(files: Files, parent: Element) -> list[Element]:
 
 
 def written(root: Element) -> tuple[str, list[Element]]:
-    """The tree as text, one element begun in each line, and which one each line begins."""
+    """Format a tree as text with one element begun in each line.
+
+    Returns:
+        The text, and the element that begins in each line.
+    """
     elements = list(root.iter())
     for element in elements:
         element.text = "\n" if len(element) else None
@@ -193,7 +213,7 @@ def written(root: Element) -> tuple[str, list[Element]]:
 
 
 def children(element: Element, *path: str) -> list[Element]:
-    """All elements that a path of tags leads to; a tag may stand repeatedly."""
+    """Find all elements at a path of tags below an element; each tag may occur repeatedly."""
     found = [element]
     for tag in path:
         found = [child for parent in found for child in parent if child.tag == tag]
