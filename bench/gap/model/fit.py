@@ -397,7 +397,7 @@ class Fitter:
             prior_of(self.world),
             self.world.known,
             problem.damping,
-            problem.stuck(residual, jacobian),  # clipped afterwards, they would spoil the rest
+            problem.stuck(residual, jacobian),  # clipping them afterwards would distort the step
         )
         problem.promised = step.promised
         # The fit has converged, no step is short enough, or numbers overflow.

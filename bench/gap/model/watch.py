@@ -79,7 +79,7 @@ class Cut:
 
 
 class EndedError(Exception):
-    """The search has to end now."""
+    """Raised when the search has to end now."""
 
 
 class Watch:
