@@ -1,8 +1,8 @@
-"""Collects what would explain the same as well, effect by effect.
+"""Alternative causes that explain the data as well as the effects found.
 
-A model with effects N stands beside every model of the same size that shares all of N but one. The
-effect by which they differ is an alternative if that model is not behind by odds of 33 to 1, fitted
-and held-out runs together.
+A model is compared with every model of the same size that shares all effects but one. The differing
+effect is an alternative if that model is not worse by odds of 33 to 1, on fitted and held-out runs
+together.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from bench.gap.model.models import Model
 
 @dataclass(frozen=True)
 class Evidence:
-    """One effect that was found, and what speaks for it.
+    """An effect that was found, with its evidence.
 
     Attributes:
         effect: its name.
-        alternatives: effects that would explain the same as well, the most plausible first.
-        p_value: chance of a gain like its own if it were not there.
-        gain: twice the log likelihood lost without it.
-        preferred: which of the set should stand for it: the likeliest, held-out runs included, of
-            those whose coefficients are plausible.
+        alternatives: effects that explain the data as well, the most plausible first.
+        p_value: p-value of its gain under the hypothesis that it is absent.
+        gain: loss of twice the log-likelihood without it.
+        preferred: effect to report for the set: the likeliest one, including held-out runs, among
+            those with plausible coefficients.
     """
 
     effect: str
@@ -41,13 +41,13 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Alternatives:
-    """Collects them for the effects of a model.
+    """Collects alternatives for the effects of a model.
 
     Attributes:
-        search: with every model that was fitted.
-        trial: the models on held-out runs; None where there are none.
-        structure: whether the model leaves structure that no effect accounts for.
-        simulates: False where what has been fitted and scored by now must do.
+        search: the search, with every fitted model.
+        trial: results on held-out runs; None if there are none.
+        structure: whether the residual of the model has structure that no effect explains.
+        simulates: False to use only existing fits and scores.
     """
 
     search: Search
@@ -56,20 +56,22 @@ class Alternatives:
     simulates: bool = True
 
     def evidence(self, model: Model) -> tuple[Evidence, ...]:
-        """The model's effects, strongest first."""
+        """Return the evidence for each effect of the model, strongest first."""
         effects = [self._evidence(model, name) for name in model.names]
         return tuple(sorted(effects, key=lambda evidence: -evidence.gain))
 
     def _evidence(self, model: Model, effect: str) -> Evidence:
+        """Return the evidence for one effect of the model."""
         rest = self._rest(model, effect)
         gain = model.likelihood.value - rest.likelihood.value
         p_value = self._p_value(rest, effect, gain)
         rivals = self._rivals(model, effect)
-        # What explains the data with a coefficient that nobody would expect comes last in its set.
+        # Effects with implausible coefficients come last in their set.
         rivals.sort(key=lambda rival: (not self._is_plausible(rival[1]), rival))
         ordered = [name for _, name in rivals]
         alternatives = tuple(name for name in ordered if name != effect)
-        # Alike is not as likely where structure is left, so there the effect found stands.
+        # With structure in the residual, indistinguishable does not mean equally likely, so the
+        # effect found is kept.
         preferred = effect if self.structure and effect in ordered else ordered[0]
         return Evidence(
             effect=effect,
@@ -80,14 +82,17 @@ class Alternatives:
         )
 
     def _rest(self, model: Model, effect: str) -> Model:
-        """The model without the effect; the base model where that would have to be fitted."""
+        """Return the model without the effect, or the base model if that would need a new fit."""
         if self.simulates:
             return self.search.without(model, effect)
         rest = frozenset(model.names) - {effect}
         return self.search.models.get(rest, self.search.base)
 
     def _p_value(self, rest: Model, effect: str, gain: float) -> float:
-        """Chance of such a gain, or of the best score of all, about the model without it."""
+        """Return the p-value of a gain about the model without the effect.
+
+        It is the smaller one of the p-values of the gain and of the best score.
+        """
         search = self.search
         key = frozenset(rest.names)
         known = search.scored.get(key)
@@ -95,24 +100,24 @@ class Alternatives:
             return search.tests.get(key, 1.0)
         scores = known or search.scan(rest)
         chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
-        # The score is linear and the gain of a fit is not; either may see more.
+        # A score is linear and the gain of a fit is not; either may be more sensitive.
         excess = gain - chances.get(effect, 0.0)
         by_refit = tail(scores.by_chance, np.array([excess]))
         by_score = search.tests.get(key, 1.0)
         return min(by_score, by_refit)
 
     def _rivals(self, model: Model, effect: str) -> list[tuple[float, str]]:
-        """How far behind, and the name, of each effect that does as well in place of this one."""
+        """Return equivalent effects in place of the given one, with their distance."""
         shared = set(model.names) - {effect}
         rivals = [(0.0, effect)]
         for other in list(self.search.models.values()):
             names = set(other.names)
             same_size = len(names) == len(model.names)
-            # Only a model that differs in this one effect says what would do in its place.
+            # Only a model that differs in this one effect shows what could replace it.
             if not same_size or not shared < names:
                 continue
             (added,) = names - shared
-            # The model itself, and other fits of its effects.
+            # Skip the model itself, and other fits of the same effects.
             if added == effect:
                 continue
             behind = self._behind(model, other)
@@ -121,8 +126,10 @@ class Alternatives:
         return self._without_richer(rivals)
 
     def _buys_nothing(self, effect: str, other: str, behind: float) -> bool:
-        """Whether another effect takes more numbers to leave as much: where structure is left, and
-        likelihoods do not count them, each of them must come nearer, as a richer law must.
+        """Return whether another effect needs more coefficients without reducing the excess enough.
+
+        If the residual has structure, likelihoods do not account for the number of coefficients.
+        Each further coefficient must then reduce the excess as much as a richer law must.
         """
         if not self.structure:
             return False
@@ -132,8 +139,10 @@ class Alternatives:
         return further > 0 and behind > further * behind_in_excess([NEARER])
 
     def _without_richer(self, rivals: list[tuple[float, str]]) -> list[tuple[float, str]]:
-        """The rivals without those that contain another one: a family of which one member does as
-        well, a richer law of which the plain one does.
+        """Return the rivals without those that contain another rival.
+
+        These are families of which one member explains as much, and richer laws of which the
+        simpler one does.
         """
         effects = self.search.world.effects
         names = {name for _, name in rivals}
@@ -142,13 +151,14 @@ class Alternatives:
         ]
 
     def _behind(self, model: Model, other: Model) -> float:
-        """How far another model is behind, in twice the log likelihood; negative if it is ahead.
+        """Return the distance of another model in twice the log-likelihood.
 
-        Where structure is left that neither has, likelihoods compare nothing but how each mimics
-        it; then what counts is how much of the gap is left.
+        It is negative if the other model is better. If the residual has structure that neither
+        model explains, likelihoods only compare how each model mimics it. The distance then depends
+        on the excesses.
         """
         trial = self.trial
-        # Only where both were tried do held-out runs compare them.
+        # Held-out runs compare the models only if both were evaluated there.
         if trial is not None and not {model.names, other.names} <= trial.measured.keys():
             trial = None
         if self.structure:
@@ -159,7 +169,7 @@ class Alternatives:
                 ratios.append(ratio_of(left, trial.excess(model.names)))
             return behind_in_excess(ratios)
         behind = self._merit(model) - self._merit(other)
-        # Held-out runs are further data, so their likelihoods multiply.
+        # Held-out runs are further data, so their log-likelihoods are added.
         if trial is not None:
             mine = trial.measured[model.names]
             others = trial.measured[other.names]
@@ -167,9 +177,10 @@ class Alternatives:
         return behind
 
     def _merit(self, model: Model) -> float:
-        """Of a robot's model, without what its effects might gain by chance where they have but one
-        shape: what differs between two of those is that one may not be negative, say, and where
-        commands have one sign a dead band is a bias.
+        """Return the merit; for robots without the null-hypothesis penalty of single-shape effects.
+
+        Two such effects differ, for example, only in a sign constraint: if all commands have the
+        same sign, a dead band is equivalent to a bias.
         """
         world = self.search.world
         if not world.linear:
@@ -182,7 +193,7 @@ class Alternatives:
         return model.merit + lucky
 
     def _is_plausible(self, effect: str) -> bool:
-        """Whether an effect explains the gap with coefficients that one would expect."""
+        """Return whether the best fit with an effect has plausible coefficients."""
         world = self.search.world
         having = [m for m in self.search.models.values() if effect in m.names]
         if not having:

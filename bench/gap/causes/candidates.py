@@ -1,16 +1,16 @@
-"""What to try of each effect: directions in which it would change the trajectories, and where a fit
-of it may begin.
+"""Candidate effects: their sensitivity directions along the trajectories, and starts of fits.
 
-An effect's coefficients scale it (a drag), shape it (a period), or modify it (the speed of a wind
-without which there is drag in still air). Those that scale give a direction each; those that shape
-or modify are laid on a grid, since a trajectory says nothing of them while the effect is off.
+The coefficients of an effect scale it (a drag), shape it (a period), or modify it (a wind speed,
+which only matters if there is drag). Each scaling coefficient gives one direction. Shape parameters
+and modifiers are tried on a grid, because trajectories do not depend on them while the effect is
+off.
 
-With y(c) the simulated runs at coefficients c, the direction of a coefficient that scales is
+With y(c) the simulated runs at coefficients c, the direction of a scaling coefficient is
 
     d = (y(c) - y(0)) / c                                                                      (1)
 
-at a c so small that y is linear in it; where an effect has no such c (a limit changes nothing until
-the input reaches it) the direction is the whole change at one size, and holds there alone.
+at a c so small that y is linear in it. If an effect has no such c (a limit changes nothing until
+the input reaches it), the direction is the whole change at one size, and is valid only there.
 """
 
 from __future__ import annotations
@@ -38,52 +38,59 @@ from sims.base import Array, Parameter
 from sims.system import FAMILY, members_of
 
 SMALL = 1e-4
-"""Share of a plausible range at which a direction is first taken."""
+"""Size at which a direction is first computed, as a share of the plausible range."""
 LEVELS = (0.15, 0.35, 0.6, 0.85, 0.95, 0.99)
-"""Shares of the largest input at which limits, dead bands and plays are tried besides."""
+"""Sizes of limits, dead bands and backlash that are tried, as shares of the largest input."""
 WAYS = (0.003, 0.01, 0.03, 0.1, 0.3)
-"""The same of how far a run goes, for gaps."""
+"""Widths of backlash that are tried, as shares of the largest range of motion within one run."""
 GIVES = (0.01, 0.09, 0.6)
-"""Shares of the largest plausible compliance of a joint."""
+"""Compliances of a joint that are tried, as shares of the largest plausible one."""
 LIMITED = ("drive", "input/s", "input/s^2", "level", "travel", "stop", "give")
-"""What a coefficient is a part of where no small size is like a large one: a limit's takes all
-away, and in a gap nothing is passed on.
+"""Kinds of coefficients for which a small size does not act like a large one.
+
+A small limit removes everything, and within the backlash nothing is transmitted.
 """
 RATES = (0.015, 0.05, 0.12, 0.3, 0.6, 0.9)
-"""The same of what is largest for a moment alone: the rate of a command, the error of a servo."""
+"""Sizes of rate and error limits that are tried, as shares of the largest value.
+
+These quantities, such as the rate of a command or the error of a servo, peak only briefly.
+"""
 SPANS = (1.0, 0.25, 0.06, 0.016, 0.004)
-"""The same of an acceleration, which takes a command twice as long at a quarter of it."""
+"""Acceleration limits that are tried, as shares of the largest one.
+
+At a quarter of the acceleration, a command takes twice as long.
+"""
 NOTHING = 1e-11
-"""Share of the largest observation below which a change is rounding."""
+"""Minimum change of the observations that is not rounding, as a share of the largest one."""
 SHAPES = 12
-"""Sizes tried of a shape."""
+"""Number of values tried of a shape parameter."""
 FREQUENCIES = 96
-"""Frequencies tried at most."""
+"""Maximum number of frequencies tried."""
 SPREAD = 1.5
-"""How much closer slow frequencies lie than fast ones, as a power."""
+"""Exponent of the spacing of frequencies, so that low ones are closer together."""
 MODIFIED = (-0.7, -0.25, 0.0, 0.25, 0.7)
-"""Shares of its plausible range at which a coefficient that modifies is tried."""
+"""Values of a modifier that are tried, as shares of its plausible range."""
 DEPTHS = (0.005, 0.02, 0.08, 0.2)
-"""Shares of where a coordinate has been that lie beyond the stops that are tried."""
+"""Depths of end stops that are tried, as shares of the range of the coordinate."""
 HARDNESS = (0.003, 0.03, 0.3, 3.0)
-"""Shares of the largest plausible stiffness that they have."""
+"""Stiffnesses of end stops that are tried, as shares of the largest plausible one."""
 LATER = (-8, -4, -2, -1, 1, 2, 4, 8)
-"""Samples by which what happens once is made later."""
+"""Shifts of the time of a single event that are tried, in samples."""
 SHIFTS = (-1.0, -0.5, 0.5, 1.0)
-"""Cycles over the longest run by which what repeats is made faster or slower."""
+"""Shifts of a frequency or period that are tried, in cycles over the longest run."""
 
 
 @dataclass(frozen=True)
 class Probe:
-    """One direction.
+    """One candidate direction.
 
     Attributes:
-        effect: its name.
+        effect: name of the effect.
         group: number of the grid point; directions of one group act together.
-        place: which coefficient scales it.
-        c: (k,) the coefficients simulated.
-        signed: whether the coefficient may be negative.
-        fixed: whether the direction holds at this size alone.
+        place: index of the coefficient that scales it.
+        c: (k,) coefficients that are simulated.
+        signed: whether the scaling coefficient may be negative.
+        fixed: whether the direction is valid only at this size.
     """
 
     effect: str
@@ -96,8 +103,12 @@ class Probe:
 
 @dataclass(frozen=True)
 class Directions:
-    """Probes and what they change: (R, T, C, K), in units of the coefficient that scales, or of the
-    whole change.
+    """Candidate directions and their responses.
+
+    Attributes:
+        probes: the K candidates.
+        values: (R, T, C, K) changes of the runs, per unit of the scaling coefficient, or the whole
+            change for a fixed candidate.
     """
 
     probes: tuple[Probe, ...]
@@ -105,21 +116,21 @@ class Directions:
 
 
 def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
-    """What each of these effects would change about a fitted model.
+    """Compute the sensitivity directions of effects about a fitted model.
 
     Args:
         world: the runs.
-        at: the model.
-        names: effects, none of which the model has.
+        at: the fitted model.
+        names: names of effects that the model does not contain.
     """
     probes = [probe for name in names for probe in first_probes(world, at, name)]
     values = _responses(world, at, probes)
     acting = _acting(world, probes, values)
-    # Only the first answers say which coefficients modify, and only of effects that act at all.
+    # The first responses show which coefficients only modify, for effects that act at all.
     modified = list(_modified(world, probes, acting))
     places = np.flatnonzero(acting)
     probes = [probes[i] for i in places] + modified
-    # The largest array of explain: what acts moves up in its place.
+    # This is the largest array of an explanation, so active rows are moved up in place.
     for row, place in enumerate(places.tolist()):
         if row < place:
             values[row] = values[place]
@@ -130,9 +141,15 @@ def directions(world: World, at: Fit, names: Sequence[str]) -> Directions:
 
 
 def first_probes(world: World, at: Fit, name: str) -> Iterator[Probe]:
-    """Every coefficient that scales an effect, at every shape, a little of it each."""
+    """Yield a small value of every scaling coefficient of an effect, at every shape.
+
+    Args:
+        world: the runs.
+        at: the fitted model.
+        name: name of the effect.
+    """
     parameters = parameters_of(world, name)
-    # A coefficient that cannot be zero does not scale: it says where or how the others act.
+    # A coefficient that cannot be zero is a shape parameter, and does not scale the effect.
     shaping = [i for i, p in enumerate(parameters) if p.bounds[0] > 0]
     count = len(parameters)
     scaling = [i for i in range(count) if i not in shaping]
@@ -146,9 +163,9 @@ def first_probes(world: World, at: Fit, name: str) -> Iterator[Probe]:
     ]
     group = 0
     leading = coefficients[0]
-    # Coefficients that scale at one point of the grid act together: a sine with its cosine.
+    # Scaling coefficients at one grid point act together, such as a sine and a cosine.
     for point in product(*grids):
-        # Of a limit of force or of a rate every small size takes all of it away.
+        # A small limit of a force or a rate would remove all of it.
         for place in scaling if leading.of not in LIMITED else ():
             low, high = parameters[place].bounds
             c = np.zeros(count)
@@ -166,39 +183,45 @@ def first_probes(world: World, at: Fit, name: str) -> Iterator[Probe]:
         yield from _stops(world, name, group)
         return
     least, _ = parameters[0].bounds
-    # Of a limit no small size is like a large one: it is tried where the input reaches it.
+    # A small limit does not act like a large one, so limits are tried at values that the input
+    # reaches.
     if leading.of in LIMITED or (leading.of in ("input", "error") and least == 0):
         shapes = np.array(list(product(*grids)))
         yield from _limits(world, name, group, shapes if shaping else None)
 
 
 def _stood_for(world: World, at: Fit, name: str) -> bool:
-    """Whether the model has an effect that this one contains, by itself or in a family."""
+    """Return whether the model has an effect that this one contains, itself or in a family."""
     effects = [world.effects[own] for own in at.effects]
     there = {m.name for effect in effects for m in members_of(effect)}
     return bool(there & set(world.effects[name].contains))
 
 
 def _stops(world: World, name: str, first: int) -> Iterator[Probe]:
-    """Soft and hard stops at either end of where a coordinate has been, met late and early."""
+    """Yield soft and hard end stops at both ends of the range of a coordinate."""
     either = [c for side in (1.0, -1.0) for c in stopping(world, name, side, HARDNESS, DEPTHS)]
     for number, c in enumerate(either, start=first):
         yield Probe(effect=name, group=number, place=0, c=c, signed=True, fixed=True)
 
 
 def _limits(world: World, name: str, group: int, shapes: Array | None) -> Iterator[Probe]:
-    """Limits, dead bands and plays of a size that the motion or the input reaches; where other
-    coefficients shape them, at each of these (n, k - 1) too.
+    """Yield limits, dead bands and backlash of sizes that the motion or the input reaches.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        group: number of the first group.
+        shapes: (n, k - 1) shape parameters to combine with each size; None if there are none.
     """
     largest = reach(world, name)
     if not largest.any():
         return
-    # A servo's error is largest for a moment after a jump, as a command's rate is.
+    # The error of a servo peaks briefly after a jump, as the rate of a command does.
     seldom = {"input/s": RATES, "input/s^2": SPANS, "error": RATES, "travel": WAYS, "give": GIVES}
     of = world.effects[name].coefficients[0].of
     levels = seldom.get(of, LEVELS)
     if of == "travel" and world.linear:
-        # A robot's lanes cost a hundred times as much.
+        # Simulating a robot costs a hundred times as much, so fewer sizes are tried.
         levels = WAYS[1:4]
     sizes = [level * largest for level in levels]
     if shapes is not None:
@@ -215,14 +238,20 @@ def _limits(world: World, name: str, group: int, shapes: Array | None) -> Iterat
 
 
 def _grid(world: World, parameter: Parameter, tried: tuple[float, ...], travel: float) -> Array:
-    """Sizes to try of a coefficient that shapes, where the position has this range in a run; those
-    `tried` of which it says so itself.
+    """Return the values to try of a shape parameter.
+
+    Args:
+        world: the runs.
+        parameter: the shape parameter.
+        tried: values that the coefficient specifies itself, if any.
+        travel: largest range of the position in one run.
     """
     if tried:
         return np.array(tried)
     low, high = parameter.bounds
     if parameter.unit == "Hz":
-        # What comes and goes must do so once in a run, or any slow change would be periodic.
+        # A periodic effect must complete a cycle within a run, otherwise any slow change would be
+        # periodic.
         seldom = max(low, CYCLES / world.longest)
         slowest = min(seldom, high / 2.0)
         return _frequencies(slowest, high, world.longest)
@@ -231,24 +260,29 @@ def _grid(world: World, parameter: Parameter, tried: tuple[float, ...], travel: 
         return 1.0 / frequencies
     if is_instant(parameter):
         first, last = world.clock
-        # At the ends there is nothing before or after.
+        # An event at the ends of the recording would have nothing before or after it.
         return np.linspace(first, last, INSTANTS + 2)[1:-1]
     if parameter.unit == "s":
-        # What lasts much longer than the runs is constant in them; one time is at most twice the
-        # time before it.
+        # A decay much longer than the runs is constant within them; successive times differ by at
+        # most a factor of two.
         high = max(min(high, LASTING * world.longest), 2.0 * low)
         return np.geomspace(low, high, int(np.ceil(np.log2(high / low))) + 1)
     return np.geomspace(low, high, SHAPES)
 
 
 def _is_period(parameter: Parameter, travel: float) -> bool:
-    """Whether a coefficient is a period over position, of runs that go anywhere."""
+    """Return whether a coefficient is a period over position, in runs with motion."""
     return parameter.name.endswith(".period") and travel > 0
 
 
 def neighbours(world: World, fit: Fit) -> Iterator[Start]:
-    """The model with what repeats in it a little faster or slower: least squares stops at the
-    nearest such minimum.
+    """Yield starts with shifted periodic effects, event times and end stops.
+
+    Least squares stops at the nearest of the many local minima that such effects have.
+
+    Args:
+        world: the runs.
+        fit: the fitted model.
     """
     for name in fit.effects:
         for c in firmer(world, name, fit.theta[world.slots[name]]):
@@ -266,8 +300,9 @@ def neighbours(world: World, fit: Fit) -> Iterator[Start]:
 
 
 def _shifted(world: World, parameter: Parameter, value: float, travel: float) -> Iterator[float]:
-    """A frequency or a period, by parts of a cycle faster and slower; an instant by samples earlier
-    and later; nothing else.
+    """Yield shifted values of a frequency, a period or an event time; nothing for others.
+
+    Frequencies and periods are shifted by parts of a cycle, event times by samples.
     """
     if is_instant(parameter):
         for samples in LATER:
@@ -277,25 +312,25 @@ def _shifted(world: World, parameter: Parameter, value: float, travel: float) ->
             yield value + cycles / world.longest
         elif _is_period(parameter, travel) and value > 0:
             frequency = 1.0 / value + cycles / travel
-            # Slower than the longest period it might turn its sign.
+            # Beyond the longest period, the frequency might become negative.
             lowest = 1.0 / parameter.bounds[1]
             yield 1.0 / max(frequency, lowest)
 
 
 def _frequencies(low: float, high: float, extent: float) -> Array:
-    """Frequencies from low to high, half a cycle over the extent apart where they lie closest."""
+    """Return frequencies from low to high, about half a cycle over the extent apart on average."""
     halves = 2.0 * (high - low) * extent
     count = int(np.clip(halves, 4, FREQUENCIES))
-    # Slow ones lie closer: as periods they would else be far apart.
+    # Low frequencies are closer together, because their periods would be far apart otherwise.
     shares = np.linspace(0.0, 1.0, count) ** SPREAD
     frequencies: Array = low + (high - low) * shares
     return frequencies
 
 
 def _acting(world: World, probes: Sequence[Probe], values: Array) -> Mask:
-    """(K,) which probes change more than rounding does, of what they change (K, R, T, C)."""
+    """Return which probes (K,) change the runs (K, R, T, C) by more than rounding."""
     rounding = NOTHING * np.nanmax(np.abs(world.observed), axis=(0, 1))
-    # One channel that moves is enough: a sensor's effects show in no other.
+    # One changed channel is sufficient, because effects of a sensor show only in its channel.
     changes = [
         bool((np.abs(size * value) > rounding).any())
         for value, size in zip(values, _sizes(probes).tolist(), strict=True)
@@ -305,7 +340,7 @@ def _acting(world: World, probes: Sequence[Probe], values: Array) -> Mask:
 
 
 def _sizes(probes: Sequence[Probe]) -> Array:
-    """(K,) of the coefficient that scales; one where the direction is the whole change."""
+    """Return the scaling coefficients (K,); one where the direction is the whole change."""
     sizes = []
     for probe in probes:
         size = 1.0 if probe.fixed else probe.c[probe.place]
@@ -314,21 +349,19 @@ def _sizes(probes: Sequence[Probe]) -> Array:
 
 
 def _modified(world: World, probes: Sequence[Probe], acting: Mask) -> Iterator[Probe]:
-    """Grid points of coefficients that change nothing by themselves but belong to an effect that
-    acts.
-    """
+    """Yield grid points of modifiers: coefficients that act only together with an active one."""
     leading: dict[str, Probe] = {}
     idle: list[Probe] = []
     for probe, acts in zip(probes, acting, strict=True):
         if acts:
             leading.setdefault(probe.effect, probe)
-        # At its first shape a coefficient has shown already whether it acts by itself; members of a
-        # family do not modify each other.
+        # The first shape already shows whether a coefficient acts by itself; members of a family do
+        # not modify each other.
         elif probe.group == 0 and not probe.fixed and world.effects[probe.effect].place != FAMILY:
             idle.append(probe)
     modifiers: dict[str, list[Probe]] = {}
     for probe in idle:
-        # Nothing of an effect that does not act at all can be modified.
+        # An effect that does not act at all cannot be modified.
         if probe.effect in leading:
             modifiers.setdefault(probe.effect, []).append(probe)
     for name, members in modifiers.items():
@@ -336,11 +369,11 @@ def _modified(world: World, probes: Sequence[Probe], acting: Mask) -> Iterator[P
 
 
 def _grid_points(world: World, first: Probe, modifiers: Sequence[Probe]) -> Iterator[Probe]:
-    """An effect's first probe that acts, with its modifiers at every combination of sizes."""
+    """Yield the first active probe of an effect with all combinations of modifier values."""
     parameters = parameters_of(world, first.effect)
     points = product(MODIFIED, repeat=len(modifiers))
     for group, point in enumerate(points, start=1):
-        # All at zero is the effect as it was tried first.
+        # All modifiers at zero give the effect that was already tried.
         if not any(point):
             continue
         c = first.c.copy()
@@ -357,14 +390,12 @@ def _grid_points(world: World, first: Probe, modifiers: Sequence[Probe]) -> Iter
 
 
 def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
-    """(K, R, T, C): the change that each probe makes, per unit of its coefficient, or as it is
-    where that is fixed.
-    """
+    """Return the responses (K, R, T, C), per unit of the coefficient or as a whole change."""
     added = [(probe.effect, probe.c) for probe in probes]
-    # These are the largest arrays of a search, so all is done in place.
+    # These are the largest arrays of a search, so all operations are in place.
     values = changes_by(world, at, added)
     near = followed(values)
-    # A probe that the simulator cannot follow is a direction that changes nothing.
+    # A probe that the simulator cannot follow gets a direction of zeros.
     if not near.all():
         values[~near] = 0.0
     values /= _sizes(probes)[:, None, None, None]  # (1)
@@ -372,11 +403,20 @@ def _responses(world: World, at: Fit, probes: Sequence[Probe]) -> Array:
 
 
 def changes_by(world: World, at: Fit, added: Sequence[tuple[str, Array]]) -> Array:
-    """(K, R, T, C): what one more effect changes about the fitted model's runs, for each of K
-    effects with their coefficients; to first order where the simulator gives that for less.
+    """Compute the changes of a fitted model's runs by one additional effect each.
+
+    Linearised responses are used if the simulator provides them, because they cost less.
+
+    Args:
+        world: the runs.
+        at: the fitted model.
+        added: K effects with their coefficients.
+
+    Returns:
+        Changes (K, R, T, C).
     """
     if world.linear:
-        # loaded where there is a robot alone
+        # Imported here, because only robots need it.
         from bench.gap.model.tangents import responses
 
         return responses(world, at.theta, at.states, added)
@@ -386,14 +426,21 @@ def changes_by(world: World, at: Fit, added: Sequence[tuple[str, Array]]) -> Arr
 
 
 def simulate_with(world: World, at: Fit, added: Sequence[tuple[str, Array]]) -> Array:
-    """(K, R, T, C): the fitted model's runs with one more effect, for each of K effects with their
-    coefficients.
+    """Simulate the runs of a fitted model with one additional effect each.
+
+    Args:
+        world: the runs.
+        at: the fitted model.
+        added: K effects with their coefficients.
+
+    Returns:
+        Observations (K, R, T, C).
     """
     runs = len(world.tracks)
     theta = np.tile(at.theta, (len(added), 1))
     for row, (name, c) in zip(theta, added, strict=True):
         row[world.slots[name]] = c
-    # All candidates of all runs in one call: the engine steps its lanes at once.
+    # All candidates and runs are simulated in one engine call, as one batch.
     count = len(added)
     simulated = world.simulate(
         theta=np.repeat(theta, runs, axis=0),

@@ -1,7 +1,7 @@
-"""Long recordings: the search goes over fewer of their samples, and all of them confirm it.
+"""Search of long recordings on thinned runs first, confirmed on all samples.
 
-What it finds is fitted to all samples, with everything that came near it. Only where they show more
-than the few did, the search is made again on all of them.
+The model found and its close rivals are fitted to all samples. The search is repeated on all
+samples only if these show more than the thinned runs did.
 """
 
 from __future__ import annotations
@@ -16,18 +16,17 @@ from bench.gap.model.watch import EndedError
 from bench.gap.model.world import World
 
 SINGLES = 6
-"""So many of the best models with one effect are fitted to all samples besides."""
+"""Number of best single-effect models that are fitted to all samples in addition."""
 
 
 def sought(search: Search) -> Model:
-    """The model of all effects that the data show: `Search.run`, with fewer steps where runs are
-    long.
+    """Return the model of all effects that the data show; long runs are thinned first.
 
     Args:
-        search: with the base model entered.
+        search: the search, which contains the fitted base model.
 
     Raises:
-        EndedError: the search has to end before.
+        EndedError: the search had to end early.
     """
     few = thinned(search.world)
     if few is None:
@@ -39,8 +38,9 @@ def sought(search: Search) -> Model:
 
 
 def _foreseen(search: Search, few: World) -> Model:
-    """`sought`, in a world of fewer samples first."""
-    # what shows nothing at the first look, whose scores all merits need, takes no search
+    """Search on thinned runs, then confirm the result on all samples."""
+    # If the scores of the base model, which all merits need anyway, show nothing, no search is
+    # needed.
     if search.plain(search.base, UNLIKELY):
         return search.run()
     rng = search.drawing("fewer samples")
@@ -64,14 +64,14 @@ def _foreseen(search: Search, few: World) -> Model:
 
 
 def _enter(search: Search, model: Model) -> None:
-    """Take over what the few samples support as it stands: there is no time to fit it to all."""
+    """Store the model that the thinned runs support without a fit, for lack of time."""
     fitter = Fitter(search.world, search.noise, search.frozen)
     (fit,) = fitter.fit([model.fit.start()], iterations=0)
     search.supported = search.enter(fit)
 
 
 def _starts(sketch: Search, found: Model) -> list[Start]:
-    """Where fits to all samples begin: what was found, its rivals, its parts, the best singles."""
+    """Return starts of fits to all samples: the result, its rivals and parts, and best singles."""
     near = [found, *rivals(sketch, found), *smaller(sketch, found)]
     near += [sketch.without(found, name) for name in found.names]
     near += of_size(sketch, 1)[:SINGLES]
@@ -80,8 +80,10 @@ def _starts(sketch: Search, found: Model) -> list[Start]:
 
 
 def _likeliest(search: Search, found: Model) -> Model:
-    """The model that was found, as fitted to all samples; near the noise the best of its size, as
-    few samples tell rivals apart less well.
+    """Return the fit to all samples of the model that was found.
+
+    Near the noise, return the best model of its size, because thinned runs distinguish rivals less
+    well.
     """
     model = search.models[frozenset(found.names)]
     best = search.best(len(found.names))
@@ -91,8 +93,8 @@ def _likeliest(search: Search, found: Model) -> Model:
 
 
 def _confirmed(search: Search, model: Model) -> bool:
-    """Whether all samples show no more than the few did."""
-    # far from the noise more samples of the same runs show nothing new
+    """Return whether all samples show no more effects than the thinned runs did."""
+    # Far from the noise, more samples of the same runs show nothing new.
     if search.excess(model) >= FAR:
         return True
     return search.plain(model, DOUBTFUL if model.names else UNLIKELY)

@@ -1,7 +1,7 @@
-"""What groups of directions explain of residuals: least squares, many groups and residuals at once.
+"""Explained sums of squares of groups of directions: least squares for many groups and residuals.
 
-With G = <D, D> and h = <D, e> of a group's directions D and a residual e, the coefficients G^-1 h
-explain h'G^-1 h of the sum of squares <e, e>.
+With G = <D, D> and h = <D, e> of the directions D of a group and a residual e, the coefficients
+G^-1 h explain h'G^-1 h of the sum of squares <e, e>.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from bench.gap.model.world import Indices
 from sims.base import Array
 
 SMALL = 4
-"""Groups of more columns are taken as they are, without a choice of columns."""
+"""Maximum number of columns of a group for which subsets of columns are tried."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Columns that act together.
+    """Directions that act together.
 
     Attributes:
-        effect: whose they are.
-        columns: their places among the directions.
-        positive: which of them must not be negative.
+        effect: name of the effect.
+        columns: indices of the directions.
+        positive: whether each coefficient must be nonnegative.
     """
 
     effect: str
@@ -39,12 +39,12 @@ class Group:
 
 @dataclass(frozen=True)
 class Batch:
-    """Groups that are solved at once: of as many columns, the same of them held.
+    """Groups that are solved together: same number of columns, same sign constraints.
 
     Attributes:
-        places: (n,) which of the groups.
-        columns: (n, k) their places among the directions.
-        positive: (k,) which of them must not be negative.
+        places: (n,) indices of the groups.
+        columns: (n, k) indices of their directions.
+        positive: (k,) whether each coefficient must be nonnegative.
     """
 
     places: Indices
@@ -53,7 +53,7 @@ class Batch:
 
 
 def groups(directions: Directions) -> list[Group]:
-    """The directions that act together."""
+    """Return the groups of directions that act together."""
     places: dict[tuple[str, int], list[int]] = {}
     for i, probe in enumerate(directions.probes):
         key = probe.effect, probe.group
@@ -67,7 +67,7 @@ def groups(directions: Directions) -> list[Group]:
 
 
 def batches(members: Sequence[Group]) -> list[Batch]:
-    """The groups by what they have in common."""
+    """Return the groups in batches with equal sign constraints."""
     alike: dict[tuple[bool, ...], list[int]] = {}
     for i, group in enumerate(members):
         alike.setdefault(group.positive, []).append(i)
@@ -85,17 +85,19 @@ def batches(members: Sequence[Group]) -> list[Batch]:
 
 
 def explained(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Array, Array]:
-    """Sums of squares (n, S) that n groups explain, each with the best choice of its columns, and
-    the coefficients (n, k) of the first residual.
+    """Compute the sums of squares that groups explain, each with its best subset of columns.
 
-    Coefficients that must not be negative are held at zero where they would be: the least squares
-    of the constraint are those of some choice of columns, so all are tried (C. L. Lawson, R. J.
-    Hanson, Solving Least Squares Problems, 1974, chapter 23).
+    A constrained coefficient is fixed at zero if it would be negative. The constrained
+    least-squares solution is the unconstrained solution of some subset of columns, so all subsets
+    are tried (C. L. Lawson, R. J. Hanson, Solving Least Squares Problems, 1974, chapter 23).
 
     Args:
         gram: G (n, k, k) of each group.
         cross: h (n, k, S).
-        positive: (k,) which columns must not have negative coefficients.
+        positive: (k,) whether each coefficient must be nonnegative.
+
+    Returns:
+        The explained sums of squares (n, S), and the coefficients (n, k) for the first residual.
     """
     number, count, samples = cross.shape
     if count > SMALL:
@@ -103,7 +105,7 @@ def explained(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Arra
     best = np.zeros((number, samples))
     coefficients = np.zeros((number, count))
     rest = np.arange(number)
-    # Nothing is held of most effects, and all columns together explain most.
+    # Most effects have no constraint, and then all columns together explain most.
     if not any(positive):
         solved = _solved(gram, cross, list(range(count)))
         best[solved.groups] = solved.gain
@@ -115,7 +117,7 @@ def explained(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Arra
 
 
 def _chosen(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Array, Array]:
-    """The same by the best of all choices of columns."""
+    """Solve for the best of all subsets of columns; arguments and result as in `explained`."""
     number, count, samples = cross.shape
     best = np.zeros((number, samples))
     coefficients = np.zeros((number, count))
@@ -123,12 +125,12 @@ def _chosen(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Array,
         solved = _solved(gram, cross, chosen)
         held = [place for place, i in enumerate(chosen) if positive[i]]
         former = best[solved.groups]
-        # More columns must explain more than rounding: else the fewer stand.
+        # More columns must explain more than rounding error, otherwise the smaller subset is kept.
         better = solved.gain > former * (1.0 + 1e-9)
         if held:
             better &= (solved.scaled[:, held] >= 0).all(axis=1)
         best[solved.groups] = np.where(better, solved.gain, former)
-        # Columns that are not chosen have no part in it.
+        # Columns outside the subset get zero coefficients.
         improved = better[:, 0]
         rows = solved.groups[improved]
         coefficients[rows] = 0.0
@@ -137,19 +139,19 @@ def _chosen(gram: Array, cross: Array, positive: Sequence[bool]) -> tuple[Array,
 
 
 def _choices(count: int) -> Iterator[list[int]]:
-    """Every choice of at least one of so many columns, those of fewer first."""
+    """Yield every nonempty subset of `count` columns, the smallest first."""
     for size in range(1, count + 1):
         for chosen in combinations(range(count), size):
             yield list(chosen)
 
 
 class _Solved(NamedTuple):
-    """What some columns of groups explain by themselves.
+    """Least-squares solution for a subset of columns.
 
     Attributes:
-        groups: (m,) those in which they are neither absorbed nor alike.
+        groups: (m,) indices of the groups in which the columns are neither absorbed nor collinear.
         gain: (m, S) h'G^-1 h.
-        scaled: (m, k, S) G^-1 h in units of the columns' lengths.
+        scaled: (m, k, S) G^-1 h in units of the lengths of the columns.
         own: (m, k) G^-1 h of the first residual.
     """
 
@@ -160,32 +162,34 @@ class _Solved(NamedTuple):
 
 
 def _solved(gram: Array, cross: Array, chosen: list[int]) -> _Solved:
-    """Solve for some columns of each group."""
+    """Solve for a subset of columns of each group."""
     products = gram[:, chosen][:, :, chosen]
     lengths = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), 0.0))
     acting = np.flatnonzero((lengths > 0).all(axis=1))
     scale = lengths[acting][:, :, None]
     normal = products[acting] / scale / scale.transpose(0, 2, 1)
-    # Columns that are alike share what they explain in any way: a choice with fewer has it.
+    # Collinear columns have no unique solution, and a smaller subset explains the same.
     apart = np.linalg.eigvalsh(normal)[:, 0] >= RANK
     solvable = acting[apart]
     scale = scale[apart]
     right = cross[solvable[:, None], chosen] / scale
-    # For hundreds of right sides inverses are quicker, and these matrices have unit diagonals.
+    # With hundreds of right-hand sides, inverses are faster, and these matrices have unit
+    # diagonals.
     scaled = np.linalg.inv(normal[apart]) @ right
     gain = np.einsum("nks,nks->ns", scaled, right)
     return _Solved(solvable, gain, scaled, scaled[:, :, 0] / scale[:, :, 0])
 
 
 def _jointly(gram: Array, cross: Array) -> tuple[Array, Array]:
-    """The same for groups of many columns, none of them held."""
-    # Of many columns some nearly repeat others, as hats that overlap do: what they add is rounding.
+    """Solve for all columns of groups with many columns, without constraints."""
+    # Some of many columns nearly repeat others, as overlapping hats do; their contribution is
+    # rounding.
     powers = np.diagonal(gram, axis1=1, axis2=2)
     scale = np.sqrt(np.maximum(powers, 1e-300))[:, :, None]
     values, vectors = np.linalg.eigh(gram / scale / scale.transpose(0, 2, 1))
     counted = values > RANK * values[:, -1:]
     weights = np.where(counted, 1.0 / np.where(counted, values, 1.0), 0.0)
-    # Along eigenvectors G is diagonal, and h'G^-1 h a sum of one term for each.
+    # In the eigenbasis G is diagonal, so h'G^-1 h is a sum with one term for each eigenvector.
     right = vectors.transpose(0, 2, 1) @ (cross / scale)
     solved = weights[:, :, None] * right
     gain: Array = np.einsum("nks,nks->ns", right, solved)

@@ -1,5 +1,7 @@
-"""Forces of any shape along single joints: the hats of `bench.gap.causes.structure` where a system
-has several coordinates that are each driven and rubbed by themselves.
+"""Hat basis forces along single joints, for the lack-of-fit test of systems with several joints.
+
+They correspond to the hats of `bench.gap.causes.structure`, for systems in which each coordinate
+has its own drive and friction.
 """
 
 from __future__ import annotations
@@ -14,13 +16,13 @@ from sims.base import Array
 from sims.system import Coefficient, Force, Moment
 
 TIME, POSITION, SPEED = 0, 1, 2
-"""Variable of a hat."""
+"""Variables of a hat: time, position or speed of the joint."""
 ALONG, AGAINST, DRY = 0, 1, 2
-"""Direction of a hat: along the joint, against its motion in proportion to speed, or dry."""
+"""Directions of a hat: along the joint, against its motion in proportion to speed, or dry."""
 
 
 class JointHat(Force):
-    """A force over a stretch of time, position or speed of one joint."""
+    """A force within an interval of time, position or speed of one joint."""
 
     name = "probe.joint_hat"
     says = "a force acts over a stretch of time, position or speed"
@@ -32,7 +34,10 @@ class JointHat(Force):
     )
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Strength times a triangle around the centre; all lanes are of one joint."""
+        """Return strength times a triangle around the centre.
+
+        All batch elements of a call have the same joint, variable and direction.
+        """
         strength, joint, variable, centre, width, direction, slow = c
         acting = np.flatnonzero(strength[:, 0])
         if not acting.size:
@@ -41,7 +46,7 @@ class JointHat(Force):
         x, v = moment.x[:, j, None], moment.v[:, j, None]
         follows = int(variable[acting[0], 0])
         value = (moment.t, x, np.abs(v))[follows]
-        # Off, a hat has no width either, and must not divide by it.
+        # A hat that is off has zero width, which must not be a divisor.
         height = np.maximum(1.0 - np.abs(value - centre) / np.maximum(width, 1e-12), 0.0)
         dry = -v / (np.abs(v) + np.maximum(slow, 1e-9))
         way = (np.ones_like(v), -v, dry)[int(direction[acting[0], 0])]
@@ -63,11 +68,12 @@ class JointFamily(NamedTuple):
 
 
 def families(world: World, slow: float) -> Iterator[JointFamily]:
-    """Every family of hats that the recording can show.
+    """Yield every family of hats that the recording can show.
 
     Args:
         world: the runs.
-        slow: share of a speed that is seldom exceeded over which dry friction turns its sign.
+        slow: speed over which dry friction reverses its sign, as a share of the high speed of a
+            joint.
     """
     longest = world.longest
     for joint, name in enumerate(world.simulator.system.coordinates):
@@ -89,11 +95,11 @@ def families(world: World, slow: float) -> Iterator[JointFamily]:
 
 
 def _fastest(world: World, channel: int) -> float:
-    """A speed of a joint that is seldom exceeded."""
+    """Return the 98 % quantile of the speed of a joint."""
     rates = [np.zeros(1)]
     for track in world.tracks:
         if len(track.observed) > 3:
-            # Every third sample: differences of neighbours are mostly noise.
+            # Use every third sample, because differences of neighbours are mostly noise.
             step = np.diff(track.scenario.times[::3])
             rates.append(np.diff(track.observed[::3, channel]) / step)
     return float(np.nanquantile(np.abs(np.concatenate(rates)), 0.98))

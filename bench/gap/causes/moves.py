@@ -1,7 +1,7 @@
-"""Moves between models: an effect taken away, an effect replaced.
+"""Search moves between models: drop, simplify or swap effects.
 
-Forward selection never takes a step back, and its first pick is often one effect that mimics two.
-Dropping and exchanging effects of the larger model corrects that (A. Miller, Subset Selection in
+Forward selection never removes an effect, and its first choice is often one effect that mimics two.
+Dropping and exchanging effects of the larger model corrects this (A. Miller, Subset Selection in
 Regression, 2nd ed., 2002, doi:10.1201/9781420035933, chapter 3).
 """
 
@@ -19,18 +19,19 @@ from bench.gap.model.problem import Start
 from sims.base import Array
 
 NOMINATED = 7
-"""Candidates of the best scores that are refitted about one model."""
+"""Maximum number of top-scoring candidates that are refitted about one model."""
 MOVES = 2
-"""Exchanges of one effect tried in a row, at most."""
+"""Maximum number of consecutive exchanges of one effect."""
 NEARER = 0.95
-"""A richer law stands where it brings a model to less than this share of the excess over the noise
-that its simpler form leaves.
+"""Maximum excess of a model with a richer law, as a share of the excess with the simpler law.
+
+Above this share, the simpler law is used instead.
 """
 BETTER = 1e-6
-"""A merit must grow by more than this for an exchange to count; less is rounding."""
+"""Minimum gain in merit of an exchange; smaller gains are rounding."""
 
 Parts = dict[str, Array]
-"""Effects with coefficients to begin with."""
+"""Effects with their initial coefficients."""
 
 
 @dataclass
@@ -41,17 +42,23 @@ class Moves(Scored):
     _simplified: set[tuple[frozenset[str], frozenset[str]]] = field(default_factory=set)
 
     def without(self, model: Model, name: str) -> Model:
-        """The model with one of its effects taken away."""
+        """Return the model with one of its effects removed.
+
+        Args:
+            model: the model.
+            name: name of the effect.
+        """
         rest = frozenset(n for n in model.names if n != name)
         if rest not in self.models:
             self._lessen(model, [name])
         return self.models[rest]
 
     def _lessen(self, model: Model, names: Iterable[str]) -> None:
-        """Fit the model without each of these effects, from where it stands itself."""
+        """Fit the model without each of the given effects, starting from its present parameters."""
         starts = []
         for name in names:
-            # Off is zero, and no parameter of the fit: everything else begins where it stands.
+            # Zero coefficients switch the effect off, and they are not fitted; all else starts as
+            # it is.
             theta = model.fit.theta.copy()
             theta[self.world.slots[name]] = 0.0
             rest = tuple(n for n in model.names if n != name)
@@ -60,11 +67,12 @@ class Moves(Scored):
         self.refit(starts)
 
     def drop(self, model: Model) -> Model:
-        """The model without effects that it does not need; each smaller one is fitted from here,
-        known or not.
+        """Return the model without effects that it does not need.
+
+        Each smaller model is fitted from the larger one, even if it is known.
         """
         key = frozenset(model.names)
-        # From here the smaller model may reach a minimum that its own way up has missed.
+        # From here, the smaller model may reach a minimum that was missed when it was built up.
         if len(model.names) > 1 and key not in self._lessened:
             self._lessened.add(key)
             self._lessen(model, model.names)
@@ -75,9 +83,11 @@ class Moves(Scored):
         return model
 
     def plainer(self, model: Model) -> Model:
-        """The model with simpler laws in the place of richer ones that contain them, one of them or
-        all together, and with the one place that acts most in the place of all, where these come no
-        nearer to the data.
+        """Return the model with richer laws and families replaced by simpler ones.
+
+        A law is replaced by one or all of the simpler laws that it contains, and a family by its
+        most active member, if the simpler model has at least the same merit or nearly the same
+        excess.
         """
         for name in model.names:
             for parts in self._parts(model, name):
@@ -88,25 +98,29 @@ class Moves(Scored):
         return model
 
     def _parts(self, model: Model, name: str) -> Iterator[Parts]:
-        """The simpler laws at the same place that an effect contains, one by one and all together,
-        and of a family the member that changes most; each with coefficients to begin with.
+        """Yield simpler effects that may replace an effect, with initial coefficients.
+
+        They are the simpler laws at the same place, one by one and all together, and the most
+        active member of a family.
         """
         effects, slots = self.world.effects, self.world.slots
         own = model.fit.theta[slots[name]]
         together, begin = Parts(), 0
         for part in effects[name].contains:
             if part in effects and effects[part].place == effects[name].place:
-                # What scales a law comes first in the law that it is part of.
+                # The scaling coefficient of a contained law comes first in the law that contains
+                # it.
                 end = begin + slots[part].stop - slots[part].start
                 together[part], begin = own[begin:end], end
         yield from ({part: c} for part, c in together.items())
-        # Of several it is the sum where what shapes it lies beyond the data: one law with a time
-        # far longer than the runs stands for two that are told, and comes near the data at once.
+        # If the shape parameter of a law lies outside the range of the data, the law acts as the
+        # sum of its parts. One law with a time far longer than the runs replaces two simpler laws,
+        # and fits the data immediately.
         if len(together) > 1:
             yield together
         members = getattr(effects[name], "members", ())
         each = len(members[0].coefficients) if members else 0
-        # One coefficient for all places says nothing of one of them.
+        # A coefficient shared by all places says nothing about a single place.
         if len(members) > 1 and own.size == each * len(members):
             free = model.fit.free.tolist()
             columns = [free.index(place) for place in self.world.places(name)]
@@ -116,13 +130,11 @@ class Moves(Scored):
             yield {members[most].name: own[each * most : each * (most + 1)]}
 
     def _with_parts(self, model: Model, name: str, parts: Parts) -> Model:
-        """The model with simpler effects in the place of a richer one, fitted from here, known or
-        not.
-        """
+        """Return the model with simpler effects in place of a richer one, fitted from here."""
         replaced = ([*parts] if n == name else [n] for n in model.names)
         names = tuple(dict.fromkeys(chain.from_iterable(replaced)))
         key, step = frozenset(names), (frozenset(model.names), frozenset(names))
-        # A known one may be caught where its own way up has led it; one that is ahead is not.
+        # A known model may be at a poor local minimum, so it is fitted again unless it is better.
         behind = key not in self.models or self.models[key].merit < model.merit
         if behind and step not in self._simplified:
             self._simplified.add(step)
@@ -134,9 +146,9 @@ class Moves(Scored):
         return self.models[key]
 
     def swap(self, model: Model) -> Model:
-        """The best model that has one effect replaced."""
+        """Return the best model that results from replacing one effect at a time."""
         for _ in range(MOVES):
-            # Each smaller model is extended again: the effect taken away may not be the best.
+            # Each smaller model is extended again, because the removed effect may not be the best.
             self.extend([self.without(model, name) for name in model.names], NOMINATED)
             better = self.best(len(model.names))
             if better is None or better.merit <= model.merit + BETTER:

@@ -1,8 +1,9 @@
-"""Names the cause: asks one question after another, and judges by the answers.
+"""Diagnose a recording: search for causes, validate them on held-out runs, and select a verdict.
 
-Does anything move? Are the base parameters fixed? Which effects did the search find, and do they
-stand against their rivals? Do held-out runs bear them out? What would do as well? What is left? The
-thresholds that answer stand in `bench.gap.causes.rules`.
+The questions are asked in order. Does anything move? Do the data determine the base parameters?
+Which effects does the search find, and are they better than their rivals? Do held-out runs confirm
+them? Which alternatives explain the data as well? Does the residual have structure? The thresholds
+are in `bench.gap.causes.rules`.
 """
 
 from __future__ import annotations
@@ -27,22 +28,22 @@ from bench.gap.model.watch import Cut, EndedError
 from sims.base import Array
 
 SHOWN = 6
-"""So many of the best models with one effect are tried on held-out runs, to be shown."""
+"""Number of best single-effect models that are evaluated on held-out runs, for display."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found.
+    """Result of a diagnosis.
 
     Attributes:
-        verdict: one of six words.
-        model: the extended model; the base model where nothing was found.
+        verdict: one of six verdicts.
+        model: the extended model; the base model if no cause was found.
         base: the base model.
-        causes: strongest first.
-        remains: what the extended model leaves.
-        vague: base parameters that the data do not fix.
-        measured: models on held-out runs, by their effects; None where there are none.
-        cut: what was not asked; None where the search came to its end.
+        causes: the causes, strongest first.
+        remains: lack-of-fit result of the extended model.
+        vague: names of base parameters that the data do not determine.
+        measured: models on held-out runs, by their effects; None if there are none.
+        cut: early end of the search with its open questions; None if it was completed.
     """
 
     verdict: VerdictName
@@ -56,11 +57,11 @@ class Finding:
 
 
 def name(search: Search, held_out: Validation | None) -> Finding:
-    """Search, check on held-out runs, collect alternatives, and judge.
+    """Search, validate on held-out runs, collect alternatives, and select a verdict.
 
     Args:
-        search: with the base model entered.
-        held_out: the runs for measuring; None if there are none.
+        search: the search, which contains the fitted base model.
+        held_out: held-out runs for validation; None if there are none.
     """
     return answer(Inquiry(search, held_out))
 
@@ -74,12 +75,12 @@ def answer(inquiry: Inquiry) -> Finding:
 
 
 class Inquiry:
-    """The questions in their order, and what has been answered.
+    """The steps of a diagnosis, and their results so far.
 
     Args:
-        search: with the base model entered.
-        held_out: predicts held-out runs, or each run by cross-validation; None if there are
-            neither.
+        search: the search, which contains the fitted base model.
+        held_out: predicts held-out runs, or each run by cross-validation; None if neither is
+            possible.
     """
 
     def __init__(self, search: Search, held_out: Validation | None) -> None:
@@ -90,10 +91,10 @@ class Inquiry:
         self._model: Model | None = None
 
     def answered(self) -> Finding:
-        """The finding when all is answered.
+        """Return the result of the complete diagnosis.
 
         Raises:
-            EndedError: the search has to end before.
+            EndedError: the search had to end early.
         """
         unfit = self.unfit_base()
         if unfit is not None:
@@ -125,46 +126,49 @@ class Inquiry:
             unexplained=_is_unexplained(search, model, left),
             missed=trial is not None and trial.misses(model, left),
         )
-        # The base is the one that was asked first, whatever better fit of it the search came upon.
+        # Report the base model that was fitted first, even if the search found a better fit of it.
         return self._finding(verdict_of(state), base, model, causes, left)
 
     def unfit_base(self) -> Finding | None:
-        """Return the finding where nothing moves, or where the data do not fix the base model; None
-        where causes can be asked for.
+        """Return the result if causes cannot be searched, else None.
+
+        This is the case if nothing moves, or if the data do not determine the base model.
 
         Raises:
             EndedError: the search had to end before the base model was fitted.
         """
         search = self._search
-        # A base model that is not fitted to its end says nothing, of motion neither.
+        # An unfinished base fit gives no information, not even about motion.
         if self._watch.left():
             raise EndedError
-        # Without motion any test of the residuals is one of rounding.
+        # Without motion, residual tests would only test rounding.
         if shows_nothing(search):
             return _without_motion(search)
         base = search.base
         vague = unfixed(search, base)
-        # Causes would stand for values of parameters that the data do not fix.
+        # Causes would represent values of parameters that the data do not determine.
         if vague:
             left = remains(search, base)
             return Finding(verdict_of(State(fixed=False)), base, base, (), left, vague)
         return None
 
     def _try(self) -> None:
-        """Ask the held-out runs."""
+        """Validate models on held-out runs, and drop idle effects."""
         if self._held_out is None or self._model is None:
             return
         self._watch.begin("held_out")
         trial = _trial(self._search, self._model, self._held_out)
-        # Initial states that were left off would speak against their model.
+        # Unfinished fits of initial states would be held against their model.
         self._watch.check()
         self._trial = trial
-        # What is left where an idle effect was may have a simpler form, too.
+        # The effects that remain after dropping an idle one may have simpler forms.
         self._model = self._search.plainer(trial.without_idle(self._search, self._model))
 
     def _fuller(self, left: Remains) -> bool:
-        """Whether held-out runs bear out an account that has more of what the model leaves; it
-        takes the model's place.
+        """Replace the model by one with more effects if held-out runs confirm it.
+
+        Returns:
+            Whether the model was replaced.
         """
         found, trial, search = self._model, self._trial, self._search
         if found is None or trial is None or not found.names or not left.structure:
@@ -177,11 +181,11 @@ class Inquiry:
         return True
 
     def so_far(self) -> Finding:
-        """The finding where the search had to end: never more than what was answered supports."""
+        """Return the result of a search that had to end, which claims only what was tested."""
         search = self._search
         cut = self._watch.cut(self._held_out is not None)
         model = self._model or search.so_far()
-        # What nobody asked about is taken for structure, so that no share is called closed for it.
+        # The residual was not tested, so it is counted as structure and not as noise.
         left = replace(unasked(search, model), p_value=0.0)
         alternatives = Alternatives(search, self._trial, structure=False, simulates=False)
         causes = alternatives.evidence(model)
@@ -198,26 +202,27 @@ class Inquiry:
         causes: tuple[Evidence, ...],
         left: Remains,
     ) -> Finding:
+        """Return a result with the held-out evaluations."""
         measured = self._trial.measured if self._trial is not None else None
         return Finding(verdict, model, base, causes, left, measured=measured)
 
 
 def shows_nothing(search: Search) -> bool:
-    """Whether nothing moves in the recording, and nothing should."""
+    """Return whether the recording shows no motion, and the model expects none."""
     observed = search.world.observed
     largest = np.nanmax(observed, axis=(0, 1))
     smallest = np.nanmin(observed, axis=(0, 1))
     ranges = largest - smallest
-    # Parameters that the simulated runs do not show were frozen by the base fit.
+    # Parameters that do not influence the simulated runs were fixed by the base fit.
     touched = len(search.frozen) != search.world.base.size
     left = search.base.likelihood.sigma
     return rules.shows_nothing(ranges, left, search.noise.sigma, touched)
 
 
 def _without_motion(search: Search) -> Finding:
-    """Return the finding about a recording in which nothing moves."""
+    """Return the result for a recording without motion."""
     base, world = search.base, search.world
-    # Nothing can be known of any of them, and no test of what is left would mean anything.
+    # No parameter can be determined, and no test of the residual is meaningful.
     vague = tuple(world.parameters[i].name for i in world.base)
     excess = base.likelihood.sigma / search.noise.sigma
     nothing = Remains(1.0, "", excess, ())
@@ -225,7 +230,12 @@ def _without_motion(search: Search) -> Finding:
 
 
 def unfixed(search: Search, base: Model) -> tuple[str, ...]:
-    """Base parameters that shape the data and are not fixed by them, the widest first."""
+    """Return the sensitive base parameters that the data do not determine, the worst first.
+
+    Args:
+        search: the search.
+        base: the base model.
+    """
     variances = np.diagonal(covariance(search, base))
     spread = np.sqrt(np.maximum(variances, 0.0))
     parameters = [search.world.parameters[place] for place in base.fit.free]
@@ -238,18 +248,18 @@ def unfixed(search: Search, base: Model) -> tuple[str, ...]:
 
 
 def _trial(search: Search, model: Model, held_out: Validation) -> Trial:
-    """On held-out runs: the base model, the best ones with one effect, and all that are near the
-    one found.
-    """
+    """Evaluate the base model, the best singles, the result and its rivals on held-out runs."""
     models = search.models.values()
-    # Parts of the model, since an effect without which held-out runs are as good will go.
+    # Parts of the model are included, because an effect that does not help on held-out runs is
+    # dropped.
     names = set(model.names)
     parts = [m for m in models if set(m.names) < names]
     singles = [m for m in models if len(m.names) == 1]
     singles.sort(key=lambda m: -m.merit)
     near = rivals(search, model)
     trial = Trial(held_out)
-    # All at once: initial states are begun again from those of the nearest model.
+    # All models are evaluated together, so that initial states start from those of the nearest
+    # model.
     trial.measure([search.base, model, *near, *parts, *singles[:SHOWN]])
     return trial
 
@@ -257,7 +267,7 @@ def _trial(search: Search, model: Model, held_out: Validation) -> Trial:
 def _preferred(
     search: Search, trial: Trial | None, model: Model, left: Remains
 ) -> tuple[Model, tuple[Evidence, ...]]:
-    """The model of those effects that should stand for their sets, and its causes."""
+    """Return the model with the preferred effect of each set, and its causes."""
     alternatives = Alternatives(search, trial, left.structure)
     causes = alternatives.evidence(model)
     names = frozenset(cause.preferred for cause in causes)
@@ -268,8 +278,9 @@ def _preferred(
 
 
 def _is_unexplained(search: Search, model: Model, left: Remains) -> bool:
+    """Return whether the model lacks something, with a score test if none exists yet."""
     chance = search.tests.get(frozenset(model.names))
-    # What is loud was not scored while the search had no need of it.
+    # A model with a residual above the noise was not scored, because the search did not need it.
     if chance is None:
         loud = not left.structure and not search.quiet(model)
         chance = search.scan(model).p_value if loud else 1.0
@@ -277,26 +288,31 @@ def _is_unexplained(search: Search, model: Model, left: Remains) -> bool:
 
 
 def closed(search: Search, model: Model, left: Remains) -> float:
-    """Share of the gap on the fitted runs that a model closes, channels in units of noise.
+    """Return the share of the discrepancy on the fitted runs that a model removes.
 
-    With b and a the RMS that the base model and this one leave in units of the noise, it is
-    (b - max(a, 1)) / (b - 1); 0 where the base model leaves no gap.
+    With the RMS residuals b of the base model and a of this model, in units of the noise, it is (b
+    - max(a, 1)) / (b - 1), or 0 if the base model leaves no discrepancy.
+
+    Args:
+        search: the search.
+        model: the extended model.
+        left: its lack-of-fit result.
     """
     own = model.likelihood.sigma
-    # What is left without structure is noise, and may be more than an estimated floor.
+    # A residual without structure is noise, even if it exceeds an estimated noise floor.
     usable = np.isfinite(own) & ~left.structure
     floor = np.where(usable, own, search.noise.sigma)
     noise = np.maximum(floor, search.noise.sigma)
     before = _loudness(search, search.base, noise)
     after = _loudness(search, model, noise)
-    # At the noise there is no gap, and a share of it would be a quotient of rounding.
+    # At the noise floor there is no discrepancy, and the quotient would be rounding error.
     if not before > 1.0 + 1e-9:
         return 0.0
     return (before - max(after, 1.0)) / (before - 1.0)
 
 
 def _loudness(search: Search, model: Model, noise: Array) -> float:
-    """RMS of what a model leaves, in units of the noise."""
+    """Return the RMS residual of a model in units of the noise."""
     left = search.residual(model.fit) / noise
     squares = np.square(left[search.seen])
     return float(np.sqrt(squares.mean()))

@@ -1,6 +1,4 @@
-"""Where fits of a model with one more effect begin: the effects that score well, at the sizes that
-their scores say.
-"""
+"""Starts of fits with one more effect: high-scoring effects at the sizes that scores predict."""
 
 from __future__ import annotations
 
@@ -22,21 +20,31 @@ from bench.gap.model.world import World
 from sims.base import Array
 
 WHITE = 3
-"""So many of the best by sum of squares alone are refitted besides: far from the data, noise that
-remembers explains almost anything.
+"""Number of best candidates by sum of squares that are refitted in addition.
+
+Far from the data, AR(1) noise explains almost any residual, so likelihood scores are misleading.
 """
 WHOLE = 2
-"""So many of those at most whose scores are no first order, where they lead."""
+"""Maximum number of candidates scored by full simulation that are refitted.
+
+They are refitted if they outscore the best linearised candidate.
+"""
 PROMISING = 0.25
-"""Candidates are refitted that promise at least this share of the best one's score."""
+"""Minimum score of a candidate to be refitted, as a share of the best score."""
 CLOSE = 0.6
-"""The same where the scores are to first order exact."""
+"""Minimum score of a candidate to be refitted if scores are exact to first order.
+
+It is a share of the best score.
+"""
 PATIENT = 20
-"""So many of them at most, with patience."""
+"""Maximum number of candidates that are refitted in patient fits of robots."""
 SHARES = (1.0, 0.25)
-"""Of the size that a score says; the score is linear, so less of it is tried too."""
+"""Shares of the size predicted by a score at which fits start.
+
+Scores are linear, so a smaller size is tried, too.
+"""
 REACHES = (0.2, 0.7, 1.5)
-"""Shares of the plausible range at which a fit of one coefficient begins besides."""
+"""Shares of the plausible range at which fits of a single coefficient start in addition."""
 
 
 def nominated(
@@ -48,36 +56,43 @@ def nominated(
     most: int,
     patient: bool,
 ) -> list[Start]:
-    """Where to begin with the most promising candidates, at what scores say and at less; with all
-    in patience.
+    """Return starts for fits with the most promising candidates.
+
+    Args:
+        world: the runs.
+        noise: noise of each channel.
+        model: the model to extend.
+        found: sensitivity directions of the candidates.
+        scores: their scores.
+        most: maximum number of candidates.
+        patient: whether to include all candidates, or for robots up to `PATIENT`.
     """
     numbered = []
-    # Where scores are those of the simulator's own derivatives, few can be better than they seem.
+    # If scores use derivatives of the simulator, few candidates are better than their score.
     share = CLOSE if world.linear else PROMISING
     if patient and world.linear:
         most, share = PATIENT, 0.0
-    # Where scores mean less they order what is tried with patience, and leave nothing out.
+    # If scores are less reliable, they only order the patient fits, and exclude none.
     everything = patient and not world.linear
     for i in _promising(scores, most, share, everything, _apart(world, scores)):
         name = scores.effects[i]
-        # The peaks of an effect are fitted apart: each may end in a minimum of its own.
+        # The score peaks of an effect are fitted separately, because each may lead to its own
+        # minimum.
         for peak, (group, scored) in enumerate(scores.peaks[i]):
             known = _known(world, model, found, group, name)
             for c in _sizes(world, found, group, scored, name):
                 start = replace(with_effect(world, model.fit.start(), name, c), known=known)
                 numbered.append((peak, start))
-    # In patience the fit begins with the first part of the runs, so the nearest is asked there.
+    # Patient fits begin with the first part of the runs, so starts are compared there.
     share = HORIZONS[0].share if patient else 1.0
     return _nearest(world, noise, numbered, share)
 
 
 def _apart(world: World, scores: Scores) -> frozenset[int]:
-    """Places of candidates whose scores are those of whole simulations, among scores that are of
-    first order.
-    """
+    """Return the indices of candidates scored by full simulation, if the others are linearised."""
     if not world.linear:
         return frozenset()
-    # loaded where there is a robot alone
+    # Imported here, because only robots need it.
     from sims.robot.series import is_series
 
     return frozenset(i for i, name in enumerate(scores.effects) if is_series(world.effects[name]))
@@ -86,13 +101,13 @@ def _apart(world: World, scores: Scores) -> frozenset[int]:
 def _promising(
     scores: Scores, most: int, share: float, everything: bool, apart: frozenset[int]
 ) -> list[int]:
-    """Places of the candidates to refit, the most promising first."""
+    """Return the indices of the candidates to refit, the most promising first."""
     promise = scores.score - scores.chance
     ranked: list[int] = np.argsort(-promise, kind="stable").tolist()
     if everything:
         return ranked
-    # Far from the data a whole change outdoes the first order of the truth: it stands beside what
-    # is nominated, and takes nothing's place.
+    # Far from the data, the score of a full simulation may exceed the first-order score of the true
+    # effect, so such candidates are added to the others and displace none.
     order = [i for i in ranked if i not in apart]
     good = [i for i in order if promise[i] >= share * promise[order[0]]][:most]
     by_squares = [int(i) for i in np.argsort(-scores.white, kind="stable") if i not in apart]
@@ -109,12 +124,12 @@ def with_effect(world: World, start: Start, name: str, c: Array) -> Start:
     Args:
         world: the runs.
         start: the model.
-        name: of the effect.
-        c: (k,) its coefficients.
+        name: name of the effect.
+        c: (k,) coefficients of the effect.
     """
     effect = world.effects[name]
     contained, theta = effect.contains, start.theta.copy()
-    # Both at once would share what they explain in any way.
+    # An effect and one that it contains together would have no unique solution.
     for part in sorted(set(contained) & set(start.effects)):
         own = world.slots[part]
         c = effect.taking(c, part, theta[own])
@@ -125,8 +140,10 @@ def with_effect(world: World, start: Start, name: str, c: Array) -> Start:
 
 
 def _known(world: World, model: Model, found: Directions, group: Group, name: str) -> Known | None:
-    """The derivatives of the model with one more effect where it acts a little, from the model's
-    own and from the directions; None where these say nothing of a coefficient.
+    """Return approximate derivatives of the model with one more effect of small size.
+
+    They consist of the derivatives of the model and the directions; None if these do not contain
+    all coefficients.
     """
     if not world.linear:
         return None
@@ -146,12 +163,10 @@ def _known(world: World, model: Model, found: Directions, group: Group, name: st
 def _sizes(
     world: World, found: Directions, group: Group, scored: Array, name: str
 ) -> Iterator[Array]:
-    """Coefficients to begin with: as scored, less, and at shares of the plausible range where one
-    scales it.
-    """
+    """Yield initial coefficients: as scored, smaller, and at shares of the plausible range."""
     bounds = coefficient_bounds(world, name)
     first = found.probes[group.columns[0]]
-    # A direction that is one whole change says nothing of other sizes.
+    # A direction for one full size says nothing about other sizes.
     if first.fixed:
         yield first.c
         yield from stops_about(world, name, first.c)
@@ -163,7 +178,7 @@ def _sizes(
             c[place] = share * float(np.clip(size, *bounds[place]))
         yield c
         yield from instants_about(world, name, c)
-    # Of several coefficients the range says nothing about how they go together.
+    # With several coefficients, the ranges do not show how the coefficients are related.
     if len(group.columns) > 1:
         return
     place = world.slots[name].start + first.place
@@ -180,8 +195,13 @@ def _sizes(
 def _nearest(
     world: World, noise: Noise, numbered: Sequence[tuple[int, Start]], share: float
 ) -> list[Start]:
-    """Of starts of one number and the same effects the one nearest to the data over the first share
-    of the runs.
+    """Return the start with the lowest cost for each peak number and set of effects.
+
+    Args:
+        world: the runs.
+        noise: noise of each channel.
+        numbered: starts with the number of their score peak.
+        share: initial share of the runs on which the cost is computed.
     """
     if not numbered:
         return []
@@ -191,7 +211,7 @@ def _nearest(
     theta = np.repeat([s.theta for s in starts], runs, axis=0)
     states = np.concatenate([s.states for s in starts])
     lanes = np.tile(np.arange(runs), count)
-    # All starts in one call: the engine steps its lanes at once.
+    # All starts are simulated in one engine call, as one batch.
     seen = world.simulate(theta, lanes, states, share)
     seen = seen.reshape(count, runs, *seen.shape[1:])
     counted = world.counted(share)
@@ -202,7 +222,7 @@ def _nearest(
         cost = float(np.square(left).sum())
         key = (number, start.effects)
         nearest = best[key][0] if key in best else np.inf
-        # A simulation that failed has a cost that is no number, and is never the nearest.
+        # A failed simulation has the cost NaN, which is never the lowest.
         if cost < nearest:
             best[key] = cost, start
     return [start for _, start in best.values()]

@@ -1,22 +1,21 @@
-"""Inner products of residuals, directions and Jacobian, whitened, without what a model may absorb
-by itself.
+"""Whitened inner products of residuals and directions, with fitted unknowns projected out.
 
-Residual e, directions D and Jacobian J are whitened by W(phi), a first-order autoregression, run by
-run, where phi is common to all channels. W'W has three diagonals. With a_t, b_t samples of two
-columns, zero where nothing was seen, and n_t how many of the two neighbours of t are missing,
+The residual e, the directions D and the Jacobian J are whitened by W(phi), an AR(1) model, run by
+run; phi is common to all channels. W'W is tridiagonal. With samples a_t, b_t of two columns, zero
+where no sample exists, and n_t the number of missing neighbours of t,
 
     (W a)'(W b) = ((1 + phi^2) sum a_t b_t - phi sum a_t (b_t-1 + b_t+1) - phi^2 sum n_t a_t b_t)
                   / (1 - phi^2)                                                                (1)
 
-so three products of the samples serve every phi, the last of them over the ends of runs alone. What
-the model's own freedom absorbs is taken out of each product of two columns a and b by a Schur
-complement, the initial states of each run first and the parameters of all runs after (the theorem
-of R. Frisch, F. V. Waugh and M. C. Lovell), with L a root of the inverse, L L' = (J'J)^-1:
+Three sums of products therefore serve every phi; the last one needs only the ends of runs. The part
+of the inner product of two columns a and b that parameters and initial states absorb is projected
+out by a Schur complement, first for the initial states of each run, then for the parameters of all
+runs (Frisch-Waugh-Lovell theorem). With L a root of the inverse, L L' = (J'J)^-1:
 
     <a, b> = a'b - (L'J'a)'(L'J'b)                                                             (2)
 
-Directions are multiplied with each other only where they act together, so that the cost is
-proportional to their number, as it is to that of samples and of residuals.
+Directions are multiplied with each other only if they act together, so the cost is proportional to
+the number of directions, samples and residuals.
 """
 
 from __future__ import annotations
@@ -41,27 +40,29 @@ from bench.gap.model.world import Indices
 from sims.base import Array
 
 ABSORBED = 1e-12
-"""Of a direction's sum of squares less than this share is left where the model's own freedom
-absorbs it.
+"""Minimum share of the sum of squares of a direction that remains after the projection.
+
+A direction with less is absorbed by parameters and initial states.
 """
 RANK = 1e-9
-"""Directions below this share of the largest eigenvalue of their scaled products are none."""
+"""Minimum eigenvalue of scaled products that counts, as a share of the largest eigenvalue."""
 CHUNK = 400_000
-"""Numbers of one array that are worked on at once: more would not stay in the cache."""
+"""Maximum size of an array in one section, in numbers, so that it fits in the CPU cache."""
 SHORTEST = 64
-"""But so many samples at least, or each stretch would cost more than its products."""
+"""Minimum number of samples per section, so that the overhead of a section is small."""
 
 
 class _Reduced(NamedTuple):
-    """What a design is after whitening, without what is absorbed.
+    """A design after whitening and projection.
 
     Attributes:
-        states: (R, s, s) roots of the inverse normal matrices of initial states.
-        by_states: (R s, q + K) L'J'a of eq. (2), of parameters and directions.
-        own: (q, q) the root for the parameters.
-        by_own: (q, K) what they take from directions.
+        states: (R, s, s) roots of the inverse normal matrices of the initial states.
+        by_states: (R s, q + K) L'J'a of eq. (2) for the initial states, of parameters and
+            directions.
+        own: (q, q) root for the parameters.
+        by_own: (q, K) L'J'a of eq. (2) for the parameters, of directions.
         grams: (n, k, k) products of directions in each block.
-        acting: (K,) which of them are not absorbed.
+        acting: (K,) mask of directions that are not absorbed.
     """
 
     states: Array
@@ -73,18 +74,17 @@ class _Reduced(NamedTuple):
 
 
 class Design:
-    """What products about one model have in common, whatever the residuals: its Jacobian and the
-    directions.
+    """Jacobian and directions of one model, as needed for products with any residuals.
 
     Attributes:
         blocks: as given.
 
     Args:
         at: the model.
-        directions: (R, T, C, K) what each would change.
-        seen: (R, T, C) which samples there are.
-        sigma: (C,) that weighs the channels.
-        blocks: (n, k) each, columns of the directions that act together, as many in every row.
+        directions: (R, T, C, K) change of the runs by each direction.
+        seen: (R, T, C) mask of available samples.
+        sigma: (C,) weights of the channels.
+        blocks: arrays (n, k) of column indices; the directions in a row act together.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class Design:
             self._add(place)
 
     def _places(self) -> Iterator[Place]:
-        """All runs, in stretches that stay in the cache."""
+        """Yield all runs in sections that fit in the CPU cache."""
         count, runs, length, channels = self._directions.shape
         step = max(CHUNK // (max(count, 1) * channels), SHORTEST)
         for run in range(runs):
@@ -118,10 +118,10 @@ class Design:
                 yield Place(run, begin, end, edge, without[edge])
 
     def _columns(self, values: Array, place: Place, beside: bool = True) -> Columns:
-        """Of values (k, R, T, C); the neighbours only where they are asked for."""
+        """Return the columns of values (k, R, T, C); neighbours only if requested."""
         run, begin, end = place.run, place.begin, place.end
         rows = len(values)
-        # One sample more at either side, as a neighbour of the outermost.
+        # Include one more sample on either side, as a neighbour of the outermost samples.
         first, last = (max(begin - 1, 0), end + 1) if beside else (begin, end)
         around = values[:, run, first:last] * self._weights[run, first:last]
         now = around[:, begin - first : end - first]
@@ -131,28 +131,33 @@ class Design:
             near[:, now.shape[1] - former.shape[1] :] += former
             latter = around[:, begin - first + 1 :]
             near[:, : latter.shape[1]] += latter
-        # Written out, as -1 is ambiguous where there are no rows.
+        # The shape is written out, because -1 is ambiguous if there are no rows.
         size = rows, now.shape[1] * now.shape[2]
         flat = now.reshape(size)
         return Columns(flat, near.reshape(size), flat[:, place.edge])
 
     def _add(self, place: Place) -> None:
-        """The products of one stretch."""
+        """Add the products of one section."""
         own = self._columns(self._jacobian, place)
         some = self._columns(self._directions, place)
         gather(part_of(self._normal, place.run), own, own, place)
         gather(part_of(self._mixed, place.run), own, some, place)
         add_squares(self._powers, some, place)
         for block, parts in zip(self.blocks, self._grams, strict=True):
-            # A column that acts alone has its square already.
+            # The square of a single column is already known.
             if block.shape[1] > 1:
                 members = Columns(some.now[block], some.near[block], some.edge[block])
                 gather(parts, members, members, place)
 
     def crossed(self, *residuals: Array) -> tuple[Parts, Parts, Parts]:
-        """Products of residuals (S, R, T, C), any number of arrays one after another, with
-        themselves (S,), with the Jacobian run by run (R, q + s, S), and of directions with them
-        (K, S).
+        """Compute products of residuals with themselves, with the Jacobian, and with directions.
+
+        Args:
+            *residuals: arrays (S_i, R, T, C) of residuals, which are concatenated to S residuals.
+
+        Returns:
+            Products of residuals with themselves (S,), with the Jacobian per run (R, q + s, S), and
+            of directions with residuals (K, S).
         """
         size, runs, *_ = self._jacobian.shape
         samples = sum(len(some) for some in residuals)
@@ -160,7 +165,7 @@ class Design:
         shared = Parts.of(runs, size, samples)
         cross = Parts.of(len(self._directions), samples)
         for place in self._places():
-            # Stretch by stretch: side by side as a whole they would take their memory once more.
+            # Concatenate section by section, because whole copies would double the memory.
             parts = [self._columns(some, place) for some in residuals]
             left = Columns(*(np.concatenate(rows) for rows in zip(*parts, strict=True)))
             own = self._columns(self._jacobian, place)
@@ -171,8 +176,10 @@ class Design:
         return squares, shared, cross
 
     def left(self, residuals: Array) -> Array:
-        """What a fit of all that the model may absorb, by least squares, leaves of residuals
-        (S, R, T, C).
+        """Return the residuals of a least-squares fit of parameters and initial states.
+
+        Args:
+            residuals: (S, R, T, C) residuals before the fit.
         """
         known = self.reduced(0.0)
         q = self._own
@@ -184,7 +191,8 @@ class Design:
             ]
         )
         by_states, by_own = _taken(known, shared)
-        # Backwards: coefficients of the parameters, then of each run's initial states.
+        # Back substitution: first coefficients of the parameters, then of the initial states of
+        # each run.
         parameters = known.own @ by_own
         rest = by_states - known.by_states[:, :q] @ parameters
         runs, size, _ = known.states.shape
@@ -197,18 +205,19 @@ class Design:
         return np.where(self._weights > 0, result, 0.0)
 
     def reduced(self, phi: float) -> _Reduced:
-        """Whitened by a correlation, without what is absorbed; kept for the next residuals."""
+        """Return the design whitened with a correlation and projected; the result is cached."""
         if phi not in self._known:
             self._known[phi] = self._reduce(phi)
         return self._known[phi]
 
     def _reduce(self, phi: float) -> _Reduced:
+        """Whiten and project the design for one correlation."""
         q = self._own
         normal = self._normal.at(phi)
         mixed = self._mixed.at(phi)
         powers = self._powers.at(phi)
 
-        # (2) with the initial states of each run for J, then with the parameters.
+        # Eq. (2) for the initial states of each run, then for the parameters.
         states = _root(normal[:, q:, q:])
         others = np.concatenate([normal[:, q:, :q], mixed[:, q:]], axis=2)
         by_states = _absorbed(states, others)
@@ -217,7 +226,7 @@ class Design:
         own = _root(left)
         by_own = own.T @ (mixed[:, :q].sum(axis=0) - by_parameters.T @ by_directions)
 
-        # Of directions that are absorbed only rounding is left, which would explain at random.
+        # Only rounding remains of absorbed directions, which would explain residuals at random.
         taken = np.concatenate([by_directions, by_own])
         remaining = powers - np.einsum("ak,ak->k", taken, taken)
         acting = remaining > ABSORBED * powers
@@ -229,7 +238,7 @@ class Design:
                 continue
             columns = np.moveaxis(taken[:, block], 0, 2)
             gram = parts.at(phi) - columns @ columns.transpose(0, 2, 1)
-            # Rounding has made the two halves differ, and an eigensolver reads one of them.
+            # Rounding makes the two halves differ, and the eigensolver reads only one of them.
             symmetric = (gram + gram.transpose(0, 2, 1)) / 2.0
             both = acting[block][:, :, None] & acting[block][:, None, :]
             grams.append(np.where(both, symmetric, 0.0))
@@ -237,12 +246,11 @@ class Design:
 
 
 class Products:
-    """Inner products of residuals and directions after all that the model's own freedom absorbs is
-    taken out, eq. (2).
+    """Inner products (2) of residuals and directions, with fitted unknowns projected out.
 
     Args:
-        design: the model's Jacobian and the directions.
-        residuals: (S, R, T, C), zero where nothing was seen; any number of arrays.
+        design: the Jacobian of the model and the directions.
+        *residuals: arrays (S_i, R, T, C) of residuals, zero where no sample exists.
     """
 
     def __init__(self, design: Design, *residuals: Array) -> None:
@@ -250,11 +258,14 @@ class Products:
         self._squares, self._shared, self._cross = design.crossed(*residuals)
 
     def projected(self, phi: float) -> tuple[Array, list[Array], Array]:
-        """Products of eq. (2) after whitening by a correlation.
+        """Return the products of eq. (2) after whitening with a correlation.
+
+        Args:
+            phi: the AR(1) correlation.
 
         Returns:
             Sums of squares (S,) of the residuals, products (n, k, k) of the directions in each
-            block, and of directions with residuals (K, S).
+            block, and products of directions with residuals (K, S).
         """
         known = self._design.reduced(phi)
         q = len(known.own)
@@ -267,37 +278,41 @@ class Products:
 
 
 def _flat(values: Array) -> Array:
-    """Rows (k, T, C) with all channels in a row."""
+    """Return rows (k, T, C) with all channels in one row."""
     return values.reshape(len(values), -1)
 
 
 def _taken(known: _Reduced, shared: Array) -> tuple[Array, Array]:
-    """L'J'e of eq. (2) for initial states (R s, S) and for parameters (q, S), of the products
-    (R, q + s, S) of the Jacobian with residuals.
+    """Return L'J'e of eq. (2) for initial states (R s, S) and for parameters (q, S).
+
+    Args:
+        known: the whitened design.
+        shared: (R, q + s, S) products of the Jacobian with residuals.
     """
     q = len(known.own)
-    # With the initial states of each run for J, then with the parameters.
+    # First the initial states of each run, then the parameters.
     by_states = _absorbed(known.states, shared[:, q:])
     left = shared[:, :q].sum(axis=0) - known.by_states[:, :q].T @ by_states
     return by_states, known.own.T @ left
 
 
 def _absorbed(roots: Array, products: Array) -> Array:
-    """(R s, n) L'J'a of eq. (2), of products (R, s, n)."""
+    """Return L'J'a of eq. (2), (R s, n), from products (R, s, n)."""
     runs, size, count = products.shape
     return (roots.transpose(0, 2, 1) @ products).reshape(runs * size, count)
 
 
 def _root(normal: Array) -> Array:
-    """L of eq. (2) for positive semidefinite matrices (..., s, s); directions that hardly count are
-    left out.
+    """Return L of eq. (2) for positive semidefinite matrices (..., s, s).
+
+    Eigenvectors with very small eigenvalues are omitted.
     """
     if not normal.shape[-1]:
         return normal
-    # Columns of any unit on one scale, so that the cut-off means the same for each.
+    # Scale the columns to unit length, so that the cutoff does not depend on their units.
     powers = np.diagonal(normal, axis1=-2, axis2=-1)
     scale = np.sqrt(np.maximum(powers, 0.0))
-    # A row of zeros stays one: divided by infinity it has no part in any direction.
+    # A row of zeros remains zero, because it is divided by infinity.
     scale = np.where(scale > 0, scale, np.inf)[..., None]
     values, vectors = np.linalg.eigh(normal / scale / np.swapaxes(scale, -1, -2))
     largest = np.maximum(values[..., -1:], 1e-300)

@@ -1,6 +1,4 @@
-"""Where an effect that acts at a place, a size or an instant may begin to act: what inputs, errors
-and levels reach, where a coordinate has been, and when samples were taken.
-"""
+"""Initial values of effect coefficients: levels that signals reach, end stops, and event times."""
 
 from __future__ import annotations
 
@@ -16,34 +14,47 @@ from sims.base import Array, Parameter
 from sims.system import Effect, members_of
 
 HARDER = (0.3, 1.0, 3.0)
-"""Times as hard as a stop that scores well, of those that a fit may begin with."""
+"""Stiffness factors of end stops that a fit starts from, relative to the best-scoring one."""
 DEEPER = tuple(np.geomspace(0.002, 0.4, 10).tolist())
-"""Shares of where a coordinate has been that lie beyond them."""
+"""Depths of end stops within the range of a coordinate, as shares of the range."""
 FIRMER = (0.25, 0.5, 2.0, 4.0)
-"""Times as hard as a stop that was found, of others that turn back at the same place."""
+"""Stiffness factors of alternative end stops with the same turning point as the fitted one."""
 INSTANTS = 24
-"""Instants tried of what happens once."""
+"""Number of times tried for a single event."""
 BRIEF = 0.05
-"""Seconds for which it hardly shows that a servo plans its own way to a command."""
+"""Duration in seconds below which the motion profile of a servo is hardly visible."""
 FINER = 16
-"""Stamps between two of them that are tried where a fit begins, at most."""
+"""Maximum number of times between two tried event times at which a fit starts."""
 
 
 def parameters_of(world: World, name: str) -> Sequence[Parameter]:
-    """The coefficients of an effect, with their units and their plausible ranges."""
+    """Return the coefficients of an effect as parameters, with units and plausible ranges.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+    """
     return world.parameters[world.slots[name]]
 
 
 def reach(world: World, name: str) -> Array:
-    """(k,) of each place where an effect limits something, what is reached there."""
+    """Return the largest values (k,) that the limited quantity of an effect reaches in the runs.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+
+    Returns:
+        One value for each member of the effect (a family has several).
+    """
     effect = world.effects[name]
     members = members_of(effect)
     of = effect.coefficients[0].of
     if of == "give":
-        # What shapes it stands behind.
+        # The coefficients after the first one are shape parameters.
         return np.array([parameters_of(world, name)[0].bounds[1]])
     if of == "drive" or (of == "level" and not _recorded(world, effect)):
-        # How large a force gets is not recorded: what is plausible has to do.
+        # The range of the quantity is not recorded, so the plausible range is used.
         return np.array([p.bounds[1] for p in parameters_of(world, name)])
     if of == "travel":
         return np.array([world.travel_of(name)])
@@ -53,7 +64,7 @@ def reach(world: World, name: str) -> Array:
 
 
 def _command(track: Track, effect: Effect) -> Array:
-    """(T,) the input that an effect acts on; the first one where it names none."""
+    """Return the input (T,) that an effect acts on; the first input if it names none."""
     signals = track.scenario.inputs
     nothing = np.zeros(track.scenario.times.size)
     first = next(iter(signals.values()), nothing)
@@ -61,35 +72,35 @@ def _command(track: Track, effect: Effect) -> Array:
 
 
 def _largest(world: World, track: Track, effect: Effect) -> float:  # noqa: ARG001
-    """Of a run, of the input."""
+    """Return the largest magnitude of the input in a run."""
     return float(np.abs(_command(track, effect)).max())
 
 
 def _fastest(world: World, track: Track, effect: Effect) -> float:  # noqa: ARG001
-    """Of a run, from sample to sample of the input, a second."""
+    """Return the largest rate of change of the input in a run, per second."""
     risen = np.abs(np.diff(_command(track, effect)))
     return float((risen / np.diff(track.scenario.times)).max(initial=0.0))
 
 
 def _hardest(world: World, track: Track, effect: Effect) -> float:  # noqa: ARG001
-    """Of a run, the acceleration that takes the input over its range and to rest in `BRIEF`."""
+    """Return the acceleration that moves the input over its range to rest within `BRIEF`."""
     return 4.0 * float(np.ptp(_command(track, effect))) / BRIEF**2
 
 
 def _recorded(world: World, effect: Effect) -> str:
-    """The channel that shows the level an effect acts on; empty where that is not recorded."""
+    """Return the channel of the level that an effect acts on; empty if it is not recorded."""
     name = effect.place or world.simulator.system.levels[0]
     return name if name in world.channels else ""
 
 
 def _fullest(world: World, track: Track, effect: Effect) -> float:
-    """Of a run, of the level."""
+    """Return the largest value of the level in a run."""
     shown = track.observed[:, world.channels.index(_recorded(world, effect))]
     return float(np.nanmax(shown, initial=0.0))
 
 
 def _farthest(world: World, track: Track, effect: Effect) -> float:
-    """Of a run, by which a servo is off its set point; zero where that is not recorded."""
+    """Return the largest servo error in a run; zero if the coordinate is not recorded."""
     system = world.simulator.system
     place = system.primary if effect.coordinate is None else effect.coordinate
     name = system.coordinates[place]
@@ -103,8 +114,16 @@ def _farthest(world: World, track: Track, effect: Effect) -> float:
 def stopping(
     world: World, name: str, side: float, hardness: Sequence[float], depths: Sequence[float]
 ) -> Iterator[Array]:
-    """Coefficients (k,) of stops on one side, of every hardness at every depth; none where it is
-    not recorded where the coordinate has been.
+    """Yield coefficients (k,) of end stops on one side, for every stiffness and depth.
+
+    There are none if the range of the coordinate is not recorded.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        side: 1 for the upper end, -1 for the lower end.
+        hardness: stiffnesses, as shares of the largest plausible one.
+        depths: depths within the range of the coordinate, as shares of the range.
     """
     low, high = world.ends_of(name)
     parameters = parameters_of(world, name)
@@ -117,19 +136,32 @@ def stopping(
 
 
 def stops_about(world: World, name: str, c: Array) -> Iterator[Array]:
-    """Stops (k,) on the same side as one, of all kinds: how hard one is says how deep it is met;
-    nothing for other effects.
+    """Yield end stops (k,) on the same side as a given one; nothing for other effects.
+
+    All depths are tried, because the stiffness determines the depth of contact.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        c: (k,) coefficients of the given end stop.
     """
     if world.effects[name].coefficients[0].of == "stop":
         part = abs(c[0]) / parameters_of(world, name)[0].bounds[1]
-        # A robot's lanes cost a hundred times as much.
+        # Simulating a robot costs a hundred times as much, so fewer stops are tried.
         times, depths = ((1.0,), DEEPER[::2]) if world.linear else (HARDER, DEEPER)
         yield from stopping(world, name, np.sign(c[0]), [part * t for t in times], depths)
 
 
 def firmer(world: World, name: str, c: Array) -> Iterator[Array]:
-    """Softer and harder stops (k,) that turn back at the same place as one: how deep a motion of
-    the same energy goes is k^(-2/5) by (2) of `sims.effects.state`.
+    """Yield softer and harder end stops (k,) with the same turning point as a given one.
+
+    The depth of contact for a motion of equal energy is proportional to k^(-2/5), by (2) of
+    `sims.effects.state`.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        c: (k,) coefficients of the given end stop.
     """
     low, high = world.ends_of(name)
     if world.effects[name].coefficients[0].of != "stop" or not c[0]:
@@ -143,8 +175,15 @@ def firmer(world: World, name: str, c: Array) -> Iterator[Array]:
 
 
 def instants_about(world: World, name: str, c: Array) -> Iterator[Array]:
-    """The coefficients (k,) of an effect that happens once, with its instant between any two
-    stamps that are as near as the next instants that are tried; nothing for other effects.
+    """Yield coefficients (k,) with event times between time stamps, near a given event time.
+
+    The times cover the interval to the next tried event times. Nothing is generated for effects
+    without an event time.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        c: (k,) given coefficients.
     """
     for i, parameter in enumerate(parameters_of(world, name)):
         if not is_instant(parameter):

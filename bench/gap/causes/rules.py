@@ -1,8 +1,8 @@
-"""Which of six verdicts a state of affairs is, and every threshold that decides it.
+"""Decision thresholds, and the rules that select one of six verdicts.
 
-`bench.gap.causes.name` asks the questions, in order; the answers are rules here, one function each.
-Errors are in units of the noise unless said otherwise: RMS 1 is noise alone, and an *excess* is
-that RMS less one, so that 0 is a model that leaves nothing but noise.
+`bench.gap.causes.name` asks the questions in order; each answer is decided by one function here.
+Errors are in units of the noise unless stated otherwise: RMS 1 is noise alone. An *excess* is this
+RMS minus one, so it is 0 for a model whose residual is only noise.
 """
 
 from __future__ import annotations
@@ -25,189 +25,213 @@ MEANING: Mapping[VerdictName, str] = {
     "unknown": "something is missing that no effect of the library explains",
     "unidentifiable": "the data do not fix the parameters of the model without any cause",
 }
-"""What each verdict says, in one sentence."""
+"""Meaning of each verdict, in one sentence."""
 
 STILL = 6.0
-"""A channel whose range is below so many sigmas of its noise shows no motion."""
+"""Maximum range of a channel without motion, in sigmas of its noise."""
 AT_REST = 3.0
-"""What the base model leaves of a recording without motion is below so many sigmas of the noise."""
+"""Maximum residual of the base model for a recording without motion, in sigmas of the noise."""
 VAGUE = 0.5
-"""A base parameter is not fixed if its 1 sigma is more than this share of its bounds."""
+"""Maximum standard error of an identifiable base parameter, as a share of its bounds."""
 EXCESS = 0.05
-"""What is left may exceed the stated noise by this share: no sensor is known better."""
+"""Maximum relative excess of the residual over specified noise; no sensor is known better."""
 SIGMAS = 4.0
-"""It may exceed that by so many standard errors besides, since it is a finite sample's RMS."""
+"""Maximum further excess of the residual, in standard errors of its finite-sample RMS."""
 SLOWEST = 7.0
-"""Estimated noise that is exceeded by more than this factor would have to remember for 30 samples:
-that is no sensor's.
+"""Maximum ratio of the residual to an estimated noise floor that AR(1) noise may explain.
+
+A larger ratio would require a correlation over 30 samples, which no sensor noise has.
 """
 CHANCE = 1e-3
-"""Chance at which structure would be seen where there is none."""
+"""P-value threshold of the lack-of-fit test if the recording specifies its noise."""
 UNSURE = 1e-4
-"""The same where the recording states no noise, and a noise that remembers may be all there is."""
+"""P-value threshold of the lack-of-fit test if noise is estimated, as it may be autocorrelated."""
 ALPHA = 0.003
-"""Chance at which an effect would be taken for real although nothing is missing."""
+"""P-value threshold for accepting an effect."""
 NOTICED = 0.5
-"""Excess of held-out runs above which an effect must make a clear difference to them."""
+"""Excess on held-out runs above which an effect must reduce it clearly."""
 HELPS = 0.1
-"""Share of that excess which counts as a clear difference."""
+"""Minimum relative reduction of the held-out excess that is a clear reduction."""
 SWITCH = 7.0
-"""Twice the log likelihood by which two models must differ to be told apart: odds of 33 to 1."""
+"""Minimum difference in twice the log-likelihood of distinguishable models: odds of 33 to 1."""
 SIMILAR = 1.2
-"""Where structure is left, causes are alike that leave less than so many times the same excess."""
+"""Maximum ratio of excesses of indistinguishable causes, if the residual has structure."""
 AT_THE_NOISE = 0.1
-"""An excess below this is as good as none, and ratios of excesses are not taken of less."""
+"""Minimum excess in ratios of excesses; smaller values are replaced by it."""
 EXPLAINED = 0.7
-"""Share of the gap that the effects must close to be taken for its explanation."""
+"""Minimum share of the discrepancy that effects must remove to be its explanation."""
 STRANGE = 0.5
-"""Excess of held-out runs above which they show something that the fitted runs do not."""
+"""Minimum excess on held-out runs that shows something the fitted runs do not."""
 CUT: Mapping[VerdictName, str] = {
     "partial": "the causes are real, and what else is missing was not asked to the end",
     "unknown": "the search was ended before it could say what is missing",
 }
-"""The same as `MEANING` of a search that was ended early, which has no other verdicts."""
+"""Meaning of each verdict of a search that ended early; such a search has no other verdicts."""
 OPEN: str = "a cause is found, but a number of it lies at a bound or has no finite interval"
-"""What `partial` says where a number of a cause is not a result."""
+"""Meaning of `partial` if a coefficient of a cause is at a bound or has no finite interval."""
 BORDERING: str = (
     "a cause is found, but a base parameter ends at a bound of its range, "
     "and the cause may stand for a value beyond it"
 )
-"""What `partial` says where a base parameter is not a result."""
+"""Meaning of `partial` if a base parameter is at a bound of its range."""
 FAULTY: str = "the recording states a unit or a sign wrongly; correct it before causes are searched"
-"""What `unknown` says of a recording with a wrong unit or sign."""
+"""Meaning of `unknown` for a recording with a wrong unit or sign."""
 LAST: Collection[str] = frozenset({"structure", "alternatives"})
-"""Questions without which a cause may be real already."""
+"""Questions that need not be answered for a cause to be accepted."""
 
 
 def shows_nothing(ranges: Array, left: Array, sigma: Array, touched: bool) -> bool:
-    """Whether a recording shows no motion, and its model expects none: nothing can be learnt.
+    """Return whether a recording shows no motion and the model expects none.
 
-    Both are asked, since a body that rests where it ought to fall is a finding.
+    Both are required, because a body that rests where it should fall is a discrepancy.
 
     Args:
-        ranges: (C,) largest less smallest value of each channel.
-        left: (C,) what the base model leaves, 1 sigma, in the channel's unit.
-        sigma: (C,) the noise floor in the channel's unit.
+        ranges: (C,) maximum minus minimum of each channel.
+        left: (C,) standard deviation of the residual of the base model, in the unit of the channel.
+        sigma: (C,) noise floor in the unit of the channel.
         touched: whether any base parameter changes the simulated runs.
     """
     still = bool((ranges < STILL * sigma).all() and (left < AT_REST * sigma).all())
-    # A recording that is one constant has nothing to say whatever its model expects.
+    # A completely constant recording contains no information, whatever the model expects.
     return (still and not touched) or not ranges.any()
 
 
 def is_fixed(sd: float, low: float, high: float) -> bool:
-    """Whether the data fix a base parameter with this standard error and these bounds.
+    """Return whether the data determine a base parameter.
 
-    Bounds are what is physically possible, so half of their width is next to no knowledge.
+    Bounds are what is physically possible, so a standard error of half their width means almost no
+    information.
+
+    Args:
+        sd: standard error of the parameter.
+        low: lower bound.
+        high: upper bound.
     """
     return sd < VAGUE * (high - low)
 
 
 def is_loud(excess: float, error: float, stated: bool) -> bool:
-    """Whether what is left of a channel exceeds its noise by more than the noise is in doubt.
+    """Return whether the residual of a channel exceeds its noise significantly.
 
     Args:
-        excess: RMS left in units of the noise floor.
-        error: standard error of that RMS, as a share of it.
-        stated: whether the recording states the noise; an estimated floor takes noise for white and
-            may be several times too small.
+        excess: RMS residual in units of the noise floor.
+        error: relative standard error of this RMS.
+        stated: whether the recording specifies the noise; an estimated floor assumes white noise
+            and may be several times too small.
     """
     return excess > (1.0 + EXCESS + SIGMAS * error if stated else SLOWEST)
 
 
 def level_of(stated: bool) -> float:
-    """Chance below which a force of any shape is structure, by whether all noise is stated."""
+    """Return the p-value threshold of the lack-of-fit test.
+
+    Args:
+        stated: whether the noise of all channels is specified.
+    """
     return CHANCE if stated else UNSURE
 
 
 def has_structure(p_value: float, level: float, loud: Sequence[str]) -> bool:
-    """Whether structure is left: a force of any shape would help, or a channel is too loud.
+    """Return whether the residual has structure, by the lack-of-fit test or by its size.
 
-    Either test is blind to something: what is no force need not look like one, and a small force is
-    not loud.
+    Each test misses something: a cause that is not a force may not resemble one, and a small force
+    does not exceed the noise.
+
+    Args:
+        p_value: p-value of the best force of any shape.
+        level: threshold of this p-value.
+        loud: names of channels whose residual exceeds their noise.
     """
     return p_value < level or len(loud) > 0
 
 
 def is_unexplained(structure: bool, chance: float) -> bool:
-    """Whether a model lacks something: a structure of any shape, or an effect of the library."""
+    """Return whether a model lacks something: a structure in the residual, or a library effect.
+
+    Args:
+        structure: whether the residual has structure.
+        chance: p-value of the best score of the library.
+    """
     return structure or chance < ALPHA
 
 
 def helps(merits: tuple[float, float], excesses: tuple[float, float]) -> bool:
-    """Whether an effect makes held-out runs better, and clearly so while they are far from noise.
+    """Return whether an effect improves the prediction of held-out runs.
 
-    Far from the noise a small gain in merit may be mimicry of what is missing still.
+    Far from the noise, the excess must decrease clearly, because a small gain in merit may only
+    mimic another missing effect.
 
     Args:
-        merits: without the effect, and with it.
-        excesses: the same.
+        merits: merit without the effect, and with it.
+        excesses: excess without the effect, and with it.
     """
-    # Near the noise the merit alone decides: a tenth of next to nothing says nothing.
+    # Near the noise only the merit decides, because 10 % of a very small excess is meaningless.
     before, after = excesses
     return merits[1] > merits[0] and (before < NOTICED or after < (1.0 - HELPS) * before)
 
 
 def is_alike(behind: float) -> bool:
-    """Whether a model explains the data as well as another, this far behind in twice the log
-    likelihood.
+    """Return whether a model is indistinguishable from a better one.
+
+    Args:
+        behind: difference in twice the log-likelihood.
     """
     return behind < SWITCH
 
 
 def behind_in_excess(ratios: Sequence[float]) -> float:
-    """How far a model is behind on the scale of `is_alike`, from what it leaves over the noise.
+    """Return the distance between two models on the scale of `is_alike`, from their excesses.
 
-    A ratio of excesses of `SIMILAR` counts as `SWITCH` does:
+    A ratio of excesses of `SIMILAR` is equivalent to `SWITCH`:
 
         behind = SWITCH mean(log ratios) / log SIMILAR                                         (1)
 
     Args:
-        ratios: its excess by the other's, on each part of the data.
+        ratios: excess of the model divided by that of the other one, for each part of the data.
     """
     return SWITCH * float(np.mean(np.log(ratios))) / float(np.log(SIMILAR))  # (1)
 
 
 def ratio_of(excess: float, other: float) -> float:
-    """One excess by another, neither of them taken for less than `AT_THE_NOISE`."""
-    # Of two models at the noise either may be nearer by chance, by any factor.
+    """Return the ratio of two excesses, each at least `AT_THE_NOISE`."""
+    # For two models at the noise floor, the ratio is random and may be arbitrarily large.
     return max(excess, AT_THE_NOISE) / max(other, AT_THE_NOISE)
 
 
 def explains(closed: float) -> bool:
-    """Whether effects that close this share of the gap are its explanation.
+    """Return whether effects that remove this share of the discrepancy explain it.
 
-    Below it they may be real and are not what matters most, which the library then does not know.
+    Below the threshold they may be real, but the main cause is not in the library.
     """
     return not closed < EXPLAINED
 
 
 def is_missed(before: float, after: float) -> bool:
-    """Whether held-out runs show a gap that the model does not close.
+    """Return whether held-out runs show a discrepancy that the model does not remove.
 
-    Something acts there that the fitted runs did not teach: too much is left, or too little of what
-    the base model left is gone.
+    In this case something acts there that the fitted runs do not show: the excess is too large, or
+    too little of the excess of the base model is removed.
 
     Args:
         before: excess of the base model on held-out runs.
-        after: excess of the extended one.
+        after: excess of the extended model on held-out runs.
     """
     closed = before - max(after, 0.0)
-    # Asked this way round, since a simulation that failed leaves NaN and has missed.
+    # The comparison is negated, so that the NaN of a failed simulation counts as missed.
     return not after < STRANGE or (before > STRANGE and closed < EXPLAINED * before)
 
 
 @dataclass(frozen=True)
 class State:
-    """A state of affairs: what the questions have brought to light.
+    """Answers to all questions, from which the verdict follows.
 
     Attributes:
-        fixed: the data fix the base parameters that shape them.
-        causes: how many were found.
-        alternatives: at least one of them has another that does as well.
-        closed: share of the gap on the fitted runs that the causes close.
-        unexplained: the model with them still lacks something on the fitted runs.
-        missed: held-out runs show a gap that it does not close.
+        fixed: whether the data determine the sensitive base parameters.
+        causes: number of causes found.
+        alternatives: whether at least one cause has an indistinguishable alternative.
+        closed: share of the discrepancy on the fitted runs that the causes remove.
+        unexplained: whether the model with the causes still lacks something on the fitted runs.
+        missed: whether held-out runs show a discrepancy that the model does not remove.
     """
 
     fixed: bool = True
@@ -219,46 +243,49 @@ class State:
 
 
 def verdict_of(state: State) -> VerdictName:
-    """The verdict that a state of affairs is; the first question that is answered decides."""
-    # Where the base model is not fixed, every cause could be a wrong value of a parameter.
+    """Return the verdict for the given answers; the first rule that applies decides."""
+    # If the base model is not determined, every cause could be a wrong parameter value.
     if not state.fixed:
         return "unidentifiable"
     incomplete = state.unexplained or state.missed
     if not state.causes:
         return "unknown" if incomplete else "adequate"
-    # Causes that leave most of the gap mimic what is missing; they are listed and not believed.
+    # Causes that leave most of the discrepancy mimic what is missing; they are listed, but not
+    # accepted.
     if not explains(state.closed):
         return "unknown"
-    # What else is missing comes before what else would do: a set is only fair about a whole answer.
+    # Incompleteness comes before alternatives, because a set of causes is only valid for a complete
+    # answer.
     if incomplete:
         return "partial"
     return "ambiguous" if state.alternatives else "named"
 
 
 def verdict_of_numbers(verdict: VerdictName, results: bool) -> VerdictName:
-    """The verdict when the fitted numbers of the causes are known.
+    """Return the verdict when the fitted coefficients of the causes are known.
 
-    A number at a bound of its range, or without a finite interval, is not a result: its cause is
-    not named.
+    A coefficient at a bound of its range or without a finite interval is not a result, so its cause
+    is not named.
 
     Args:
-        verdict: by all other rules.
-        results: whether every number of the causes that stand alone is a result.
+        verdict: verdict by all other rules.
+        results: whether every coefficient of the causes without alternatives is a result.
     """
     return "partial" if verdict == "named" and not results else verdict
 
 
 def verdict_of_cut(causes: int, closed: float, not_asked: Sequence[str]) -> VerdictName:
-    """The verdict of a search that was ended early: never more than what was asked supports.
+    """Return the verdict of a search that ended early, which claims only what was tested.
 
-    Without an answer to every question nothing is adequate and nothing is named. Causes are real
-    where they stood against their rivals and held-out runs; else they are listed, and not believed.
+    If a question is open, the verdict is neither adequate nor named. Causes are accepted if they
+    were compared with their rivals and on held-out runs; otherwise they are listed, but not
+    accepted.
 
     Args:
-        causes: how many were found.
-        closed: share of the gap on the fitted runs that they close, what is left taken for
-            structure.
-        not_asked: the questions that are open.
+        causes: number of causes found.
+        closed: share of the discrepancy on the fitted runs that they remove, if the residual is
+            counted as structure.
+        not_asked: the open questions.
     """
     stood = all(name in LAST for name in not_asked)
     return "partial" if causes and stood and explains(closed) else "unknown"

@@ -1,26 +1,25 @@
-"""How much each candidate would explain: a score test in trajectory space, calibrated over the
-whole library.
+"""Score test of every candidate effect in trajectory space, calibrated over the whole library.
 
-What an effect changes is compared with the residual after taking out of both what the fitted
-parameters and initial states can absorb (a Lagrange multiplier test; C. R. Rao 1948,
+The response to an effect is compared with the residual after both are projected onto the complement
+of what fitted parameters and initial states can absorb (a Lagrange multiplier test; C. R. Rao 1948,
 doi:10.1017/S0305004100023987; R. F. Engle, Handbook of Econometrics II, chapter 13). The score is
-twice the gain in log likelihood, each hypothesis with the correlation of noise that suits it best,
-so that noise that remembers is no cause. What the best of a whole library reaches by chance is
-found by doing the same to surrogate residuals (max-statistic calibration; P. H. Westfall, S. S.
+twice the gain in log-likelihood. Each hypothesis uses the noise correlation that suits it best, so
+that autocorrelated noise is not mistaken for a cause. The distribution of the best score under the
+null hypothesis is found from surrogate residuals (max-statistic calibration; P. H. Westfall, S. S.
 Young 1993).
 
-The inner products <a, b> of residuals e and directions D, whitened by a correlation phi and without
-what is absorbed, are those of `bench.gap.causes.products`, eqs. (1) and (2) there; what a group of
-directions explains with G = <D, D> and h = <D, e> is found in `bench.gap.causes.gains`. The sigma
-of n samples estimated besides, twice the log likelihood is, up to a constant,
+The inner products <a, b> of residuals e and directions D, whitened with correlation phi and
+projected, are defined in `bench.gap.causes.products`, eqs. (1) and (2). The part that a group of
+directions explains, with G = <D, D> and h = <D, e>, is computed in `bench.gap.causes.gains`. With
+sigma also estimated from n samples, twice the log-likelihood is, up to a constant,
 
     l(phi) = log det W'W - n log(<e, e> - h'G^-1 h)                                            (3)
 
-and the score of an effect is the likelihood ratio, either side at its own correlation,
+and the score of an effect is the likelihood ratio, with the best correlation on either side,
 
     score = max over phi and groups of l(phi) - max over phi of l(phi) without directions      (4)
 
-For effects k and surrogates s, with chance_k the 90 % quantile of score_k over s, the p value is
+For effects k and surrogates s, with chance_k the 90 % quantile of score_k over s, the p-value is
 
     p = P(max over k of (score_k(s) - chance_k) >= max over k of (score_k - chance_k))         (5)
 """
@@ -41,21 +40,21 @@ from bench.gap.model.problem import Fit
 from sims.base import Array
 
 MANY = 12
-"""An effect with more shapes than this is begun from several of them."""
+"""Number of shapes above which fits of an effect start from several of them."""
 PEAKS = 3
-"""From so many."""
+"""Maximum number of shapes from which fits of an effect with many shapes start."""
 LUCK = 0.9
-"""Quantile over surrogates that is an effect's chance."""
+"""Quantile of a score over the surrogates that is subtracted as its null-hypothesis level."""
 EXTREME = 0.8
-"""Quantile over surrogates beyond which their tail is taken for exponential."""
+"""Quantile over the surrogates above which the tail of the distribution is exponential."""
 BEYOND = 0.2
-"""The share of them that lies there."""
+"""Share of the surrogates in the exponential tail."""
 FEWEST = 20
-"""Of fewer surrogates no tail is guessed."""
+"""Minimum number of surrogates for which a tail is extrapolated."""
 CLOSE = (3e-4, 0.06)
-"""Chances between these may decide, and are found from more surrogates."""
+"""Range of p-values that may decide, and are therefore computed from more surrogates."""
 MORE = 4
-"""So many times as many."""
+"""Factor by which the number of surrogates is increased for such p-values."""
 
 Peak = tuple[Group, Array]
 
@@ -65,17 +64,15 @@ class Scores:
     """Scores of the library about one model.
 
     Attributes:
-        effects: names, the highest score first.
-        score: twice the gain in log likelihood of each.
-        chance: its 90 % quantile over surrogates (0 without them).
-        peaks: of each its best group with the coefficients of its columns, in units of the
-            directions; behind it, where an effect has shapes by the dozen, further ones that are
-            better than their neighbours.
-        p_value: probability that the highest score of a library, less its chance, is reached with
-            nothing missing.
+        effects: names of the effects, the highest score first.
+        score: twice the gain in log-likelihood of each effect.
+        chance: 90 % quantile of the score over surrogates (0 without them).
+        peaks: for each effect, its best group with the coefficients of its columns, in units of the
+            directions; for effects with many shapes, followed by further local maxima.
+        p_value: p-value of the highest score minus its null-hypothesis level.
         phi: correlation of the noise under the best hypothesis.
-        by_chance: (E, S) scores of the surrogates, less their chance.
-        white: (E,) scores if noise does not remember.
+        by_chance: (E, S) scores of the surrogates minus their null-hypothesis level.
+        white: (E,) scores for white noise.
     """
 
     effects: tuple[str, ...]
@@ -89,13 +86,13 @@ class Scores:
 
 
 class ScoreTest:
-    """Scores every effect that has directions, against any residuals of one model.
+    """Score test of candidate effects against any residuals of one model.
 
     Args:
-        at: the model that the directions are about.
-        directions: of the candidates.
-        seen: (R, T, C) which samples there are.
-        noise: sigma weighs channels against each other; its correlation is not used.
+        at: the model that the directions refer to.
+        directions: directions of the candidates.
+        seen: (R, T, C) mask of available samples.
+        noise: its sigma weights the channels; its correlation is not used.
     """
 
     def __init__(self, at: Fit, directions: Directions, seen: Mask, noise: Noise) -> None:
@@ -109,21 +106,22 @@ class ScoreTest:
         }
 
     def left(self, residuals: Array) -> Array:
-        """What a fit of the model's own freedom leaves of residuals (S, R, T, C)."""
+        """Return residuals (S, R, T, C) after a linear fit of parameters and initial states."""
         return self._design.left(residuals)
 
     def scores(self, residual: Array, surrogate: Array | None = None) -> Scores:
         """Score a residual.
 
         Args:
-            residual: (R, T, C) what the model leaves, zero where nothing was seen.
-            surrogate: (S, R, T, C) residuals that mean nothing.
+            residual: (R, T, C) residual of the model, zero where no sample exists.
+            surrogate: (S, R, T, C) surrogate residuals for the null hypothesis; None to omit the
+                p-value.
         """
-        # The residual is the first of all: they are scored in the same products.
+        # The residual comes first, and is scored with the same products as the surrogates.
         drawn = np.zeros((0, *residual.shape)) if surrogate is None else surrogate
         table = _Table(self._groups, 1 + len(drawn), self._count)
         products = Products(self._design, residual[None], drawn)
-        # A grid: the products of one pass over the samples serve every correlation.
+        # The sums of products from one pass over the samples serve every correlation of the grid.
         for phi, determinant in self._determinants.items():
             total, grams, cross = products.projected(phi)
             table.begin(phi, determinant, total)
@@ -136,17 +134,17 @@ class ScoreTest:
 def calibrated(
     test: ScoreTest, residual: Array, draw: Callable[[int], Array], count: int
 ) -> Scores:
-    """Scores of a residual, from more surrogates where the chance is close to those that decide.
+    """Score a residual, with more surrogates if the p-value is close to a threshold.
 
-    A chance of one in a hundred that is found from a hundred surrogates is uncertain by a factor of
-    three, one that is far from every level need not be known better (J. Besag, P. Clifford,
-    Sequential Monte Carlo p-values, Biometrika 78(2), 301, 1991, doi:10.1093/biomet/78.2.301).
+    A p-value of 0.01 from a hundred surrogates is uncertain by a factor of three, and a p-value far
+    from every threshold need not be more accurate (J. Besag, P. Clifford, Sequential Monte Carlo
+    p-values, Biometrika 78(2), 301, 1991, doi:10.1093/biomet/78.2.301).
 
     Args:
-        test: about the model.
-        residual: (R, T, C) what the model leaves.
-        draw: makes so many surrogates (S, R, T, C).
-        count: how many of them are drawn first.
+        test: score test about the model.
+        residual: (R, T, C) residual of the model.
+        draw: function that draws the given number of surrogates (S, R, T, C).
+        count: number of surrogates that are drawn first.
     """
     first = test.scores(residual, draw(count))
     low, high = CLOSE
@@ -163,16 +161,25 @@ def score(
     noise: Noise,
     surrogate: Array | None = None,
 ) -> Scores:
-    """Score every effect that has directions once; arguments as those of `ScoreTest`."""
+    """Score every effect once, with a new `ScoreTest`.
+
+    Args:
+        at: the model that the directions refer to.
+        residual: (R, T, C) residual of the model, zero where no sample exists.
+        directions: directions of the candidates.
+        seen: (R, T, C) mask of available samples.
+        noise: its sigma weights the channels.
+        surrogate: (S, R, T, C) surrogate residuals; None to omit the p-value.
+    """
     return ScoreTest(at, directions, seen, noise).scores(residual, surrogate)
 
 
 class _Table:
-    """The best of every group and effect so far, over the correlations that were entered.
+    """Best likelihood of every group and effect over the correlations so far.
 
     Args:
-        members: the groups of all effects.
-        residuals: how many there are.
+        members: groups of all effects.
+        residuals: number of residuals.
         count: n of eq. (3).
     """
 
@@ -186,7 +193,7 @@ class _Table:
         self._best = np.full((effects, residuals), -np.inf)
         self._without = np.full(residuals, -np.inf)
         self._white = np.zeros(effects)
-        # Of each group as a hypothesis: twice its log likelihood, correlation, coefficients.
+        # For each group: twice its log-likelihood, its correlation and its coefficients.
         self._values = np.full(len(members), -np.inf)
         self._phis = np.zeros(len(members))
         widest = max((len(group.columns) for group in members), default=0)
@@ -196,29 +203,41 @@ class _Table:
         self._total = np.zeros(residuals)
 
     def begin(self, phi: float, determinant: float, total: Array) -> None:
-        """Take a correlation into account, with log det W'W and <e, e> (S,) of eq. (3)."""
+        """Start a correlation, with log det W'W and <e, e> (S,) of eq. (3).
+
+        Args:
+            phi: the correlation.
+            determinant: log det W'W.
+            total: (S,) sums of squares of the residuals.
+        """
         self._phi, self._determinant, self._total = phi, determinant, total
         self._gains[...] = 0.0
         nothing = self._value(total, total)
         self._without = np.maximum(self._without, nothing)
 
     def _value(self, left: Array, total: Array) -> Array:
-        """Eq. (3) of what is left of sums of squares."""
-        # What is explained whole leaves rounding, of which the logarithm has a bound.
+        """Return eq. (3) for the remaining sums of squares."""
+        # A fully explained residual leaves only rounding, so the logarithm is bounded.
         floor = 1e-12 * total + 1e-300
         logarithms = np.log(np.maximum(left, floor))
         result: Array = self._determinant - self._count * logarithms
         return result
 
     def enter(self, batch: Batch, gain: Array, coefficients: Array) -> None:
-        """What some groups explain (n, S), and their coefficients (n, k) of the residual."""
+        """Enter what the groups of a batch explain.
+
+        Args:
+            batch: the groups.
+            gain: (n, S) explained sums of squares.
+            coefficients: (n, k) coefficients for the first residual.
+        """
         rows = self._rows[batch.places]
         order = np.argsort(rows, kind="stable")
         present, first = np.unique(rows[order], return_index=True)
         largest = np.maximum.reduceat(gain[order], first, axis=0)
         self._gains[present] = np.maximum(self._gains[present], largest)
         own = self._value(self._total[0] - gain[:, 0], self._total[0])
-        # The first one is the residual; only its coefficients begin fits.
+        # The first residual is the observed one; only its coefficients are used as starts of fits.
         better = own > self._values[batch.places]
         places = batch.places[better]
         self._values[places] = own[better]
@@ -226,24 +245,24 @@ class _Table:
         self._coefficients[places, : coefficients.shape[1]] = coefficients[better]
 
     def end(self) -> None:
-        """All groups have been entered."""
+        """Finish a correlation after all groups were entered."""
         values = self._value(self._total - self._gains, self._total)
         self._best = np.maximum(self._best, values)
-        # White noise is the one of the grid that leaves sums of squares as they are.
+        # With phi = 0, whitening leaves sums of squares unchanged.
         if self._phi == 0 and len(self._names):
             nothing = self._value(self._total[0], self._total[0])
             self._white = np.maximum(values[:, 0] - nothing, 0.0)
 
     def ranked(self) -> Scores:
-        """The scores in order, and how likely the best is by chance."""
+        """Return the scores in descending order, with their p-value."""
         gains = self._best - self._without  # (4)
         observed = gains[:, 0]
         drawn = gains[:, 1:]
         chance = np.zeros(len(self._names))
         p_value = 1.0
         if drawn.shape[1]:
-            # An effect with many shapes gains more by chance, and must not set the level for the
-            # rest.
+            # An effect with many shapes has higher scores under the null hypothesis, which must not
+            # raise the level of other effects.
             chance = np.quantile(drawn, LUCK, axis=1)
             p_value = tail(drawn - chance[:, None], observed - chance)  # (5)
         by_chance = drawn - chance[:, None]
@@ -264,14 +283,12 @@ class _Table:
         )
 
     def _peaks(self, places: NDArray[np.intp]) -> tuple[Peak, ...]:
-        """Of an effect's groups the best, and of a dozen and more the next that are better than
-        their neighbours.
-        """
+        """Return the best group of an effect; with many shapes also further local maxima."""
         values = self._values[places]
         several = len(places) > MANY
         peaks = values == values.max()
         if several:
-            # Neighbours of the best are the same answer once more, so only local maxima count.
+            # Neighbours of the best group give the same result, so only local maxima count.
             around = np.concatenate([[-np.inf], values, [-np.inf]])
             above_former = values >= around[:-2]
             above_latter = values >= around[2:]
@@ -287,11 +304,14 @@ class _Table:
 
 
 def tail(by_chance: Array, observed: Array) -> float:
-    """Probability that the largest of a column of `by_chance` (E, S) reaches the largest of
-    `observed` (E,), eq. (5).
+    """Return the p-value (5) of the largest observed value.
 
-    Beyond the most extreme fifth of the surrogates the tail is taken for exponential, as that of a
-    likelihood ratio is.
+    Beyond the most extreme fifth of the surrogates, the tail is assumed to be exponential, as that
+    of a likelihood ratio is.
+
+    Args:
+        by_chance: (E, S) values of the surrogates; the maximum over E is compared.
+        observed: (E,) observed values.
     """
     if not observed.size:
         return 1.0
@@ -299,14 +319,15 @@ def tail(by_chance: Array, observed: Array) -> float:
     value = float(observed.max())
     count = largest.size
     above = int((largest >= value).sum())
-    # Counting ends at one in the number of surrogates; smaller chances are extrapolated.
+    # Counting cannot give less than one in the number of surrogates; smaller p-values are
+    # extrapolated.
     first = int(EXTREME * count)
     extreme = largest[first:]
     begin = extreme[0]
     if value <= begin or count < FEWEST:
-        # The residual counts among its surrogates, so that no p value is zero.
+        # The residual counts as one of the surrogates, so the p-value is never zero.
         return (1.0 + above) / (1.0 + count)
-    # The scale of an exponential is the mean of what lies beyond its beginning.
+    # The scale of an exponential distribution is its mean excess over the threshold.
     beyond = extreme - begin
     mean = max(float(beyond.mean()), 1e-9)
     chance = BEYOND * np.exp(-(value - begin) / mean)

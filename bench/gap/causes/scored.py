@@ -1,7 +1,8 @@
-"""What the models of a recording seem to lack: each scored against the whole library, once.
+"""Fitted models together with the scores of all effects that they lack.
 
-A model is scored by a linear test (`bench.gap.causes.score_test`); whether it lacks something is
-then asked of that score and of the size of what it leaves.
+Each model is scored once against the whole library by a linear test
+(`bench.gap.causes.score_test`). The score and the size of the residual show whether the model lacks
+something.
 """
 
 from __future__ import annotations
@@ -23,35 +24,44 @@ from bench.gap.model.world import World
 from sims.base import Array
 
 SURROGATES = 120
-"""Residuals that mean nothing, drawn to calibrate the scores about one model."""
+"""Number of surrogate residuals that calibrate the scores about one model."""
 CERTAIN = 1e-6
-"""A chance below which surrogates of another colour are not asked."""
+"""P-value below which surrogates with another spectrum are not needed."""
 LOUD = 1.3
-"""What is left that exceeds the noise floor by this factor is looked into by simulation, whatever
-the scores say.
+"""Maximum ratio of the residual to the noise floor at which the scores alone are trusted.
+
+A larger residual is examined by simulation, whatever the scores are.
 """
 FORGOT = 0.01
-"""But not over an estimated floor, where the chance that all of it is first-order noise is above
-this.
-"""
+"""Minimum p-value at which a residual above an estimated noise floor counts as AR(1) noise."""
 
 HELD = 400e6
-"""Bytes of directions that are held besides the base model's; what was scored longest ago makes
-room, and is scored again in the rare case that somebody asks for it once more.
+"""Maximum size in bytes of stored directions, in addition to those of the base model.
+
+The oldest ones are removed; in the rare case that they are needed again, they are recomputed.
 """
 SILENT = 0.02
-"""Excess over the noise below which nothing richer is fitted before something asks for it."""
+"""Maximum excess of a model at which no richer law is fitted."""
 CAUGHT = 1.0
-"""In twice the log likelihood, what a model may be behind one that it contains."""
+"""Maximum distance in twice the log-likelihood of a model from one that it contains.
+
+A fit that is further behind has stopped in a poor local minimum.
+"""
 UNMOVED = 0.1
-"""A fit that has moved by less than so many sigmas, RMS, since its directions were simulated keeps
-them: they are derivatives, and have changed by as little.
+"""Maximum RMS change of a fit, in sigmas, at which its directions are kept.
+
+Directions are derivatives, so they have changed as little as the fit.
 """
 
 
 class Scanned(NamedTuple):
-    """What each effect would change about a model, the test of that, and its scores; the
-    directions are those at a fit.
+    """Directions, score test and scores about one model.
+
+    Attributes:
+        at: the fit that the directions refer to.
+        directions: directions of the effects that the model lacks.
+        test: score test with these directions.
+        scores: scores of these effects.
     """
 
     at: Fit
@@ -62,13 +72,13 @@ class Scanned(NamedTuple):
 
 @dataclass
 class Scored(Models):
-    """Models, and what has been scored about them.
+    """Models and their scores.
 
     Attributes:
-        scored: of each model that was, by its effects, the scores.
-        scanned: of the base model and those that were scored last, all of it.
-        tests: the p value of the best score about each, by its effects.
-        former: what was scored about models that have been fitted better since.
+        scored: scores about each scored model, by its effects.
+        scanned: directions, tests and scores about the base model and the latest scored models.
+        tests: p-value of the best score about each model, by its effects.
+        former: results about models that have been replaced by better fits.
     """
 
     scored: dict[frozenset[str], Scores] = field(default_factory=dict)
@@ -83,22 +93,21 @@ class Scored(Models):
 
     @property
     def about_base(self) -> Scores | None:
-        """What was scored about it, or about the one before a better fit was found; None where
-        nothing was.
-        """
+        """Scores about the base model or its previous fit; None if there are none."""
         key: frozenset[str] = frozenset()
         if key in self.scored or key not in self.former:
             return self.scored.get(key)
         return self.former[key].scores
 
     def directions_known(self) -> tuple[Fit, Directions] | None:
-        """Return what every candidate changes about the base model's runs; None where it has not
-        been found beside the scores.
+        """Return the directions of all candidates about the base model, if already computed.
+
+        Here always None; subclasses may compute them separately from the scores.
         """
         return None
 
     def replaced(self, key: frozenset[str]) -> None:
-        """What was scored about the model before holds no longer."""
+        """Discard the scores about a model that was replaced."""
         self.scored.pop(key, None)
         if key in self.scanned:
             self.former[key] = self.scanned.pop(key)
@@ -107,8 +116,9 @@ class Scored(Models):
         """Score every effect that the model lacks.
 
         Args:
-            model: about which.
-            against: (R, T, C) a residual for surrogates; the model's own if None.
+            model: the model.
+            against: (R, T, C) residual whose spectrum the surrogates have; None for that of the
+                model.
         """
         key = frozenset(model.names)
         if key not in (self.scored if against is None else self.scanned):
@@ -117,8 +127,8 @@ class Scored(Models):
             return self.scored[key]
         known = self.scanned[key]
         self._look(model)
-        # Directions cost a simulation of each candidate; other surrogates need no new ones. The
-        # colour of noise is best known from a model that leaves less structure.
+        # Directions cost one simulation per candidate, and are reused with other surrogates. The
+        # spectrum of the noise is best estimated from a model with less structure in its residual.
         residual = self.residual(model.fit)
         stream = self.drawing("library", model.names)
         scores = _scored(known.test, residual, against, self.seen, stream)
@@ -126,8 +136,11 @@ class Scored(Models):
         return scores
 
     def _survey(self, models: Sequence[Model], beside: Sequence[Model] = ()) -> None:
-        """Score every effect that models lack, each for itself; what is known of those beside them
-        is held.
+        """Score the effects that each of the models lacks.
+
+        Args:
+            models: models to score.
+            beside: further models whose stored results must not be removed.
         """
         calls, keys = [], []
         for model in models:
@@ -136,7 +149,7 @@ class Scored(Models):
             key = frozenset(model.names)
             residual, stream = self.residual(model.fit), self.drawing("library", model.names)
             former = self.former.pop(key, None)
-            # What has hardly moved keeps its directions, which nobody else has.
+            # A model that has hardly moved keeps its directions.
             if former is not None and self._moved(former.at, model.fit) < UNMOVED:
                 scores = _scored(former.test, residual, residual, self.seen, stream)
                 self._take(key, former._replace(scores=scores))
@@ -155,16 +168,17 @@ class Scored(Models):
             self.world.watch.advance()
         for number, key in enumerate(keys):
             scores = self.scored.get(key, found[number].scores)
-            # What had made room is as it was.
+            # Scores that were kept when the directions were removed remain valid.
             self._take(key, found[number]._replace(scores=scores))
         self._make_room([*keys, *(frozenset(model.names) for model in beside)])
 
     def _look(self, model: Model) -> None:
+        """Report the scoring of a model as the next step."""
         about = " + ".join(model.names) or "the base model"
         self.world.watch.look(f"scores of the library about {about}")
 
     def _make_room(self, asked: Sequence[frozenset[str]]) -> None:
-        """Let go what was scored longest ago, but for the base model and what is asked now."""
+        """Remove the oldest stored directions, except those of the base model and of `asked`."""
         for kept in (self.former, self.scanned):
             for key in [k for k in kept if k and k not in asked]:
                 held = [*self.former.items(), *self.scanned.items()]
@@ -173,45 +187,55 @@ class Scored(Models):
                 del kept[key]
 
     def _take(self, key: frozenset[str], scanned: Scanned) -> None:
-        # The last stands behind the others.
+        # Insert the entry again, so that it is the newest one.
+        """Store results as the latest ones."""
         self.scanned.pop(key, None)
         self.scanned[key] = scanned
         self.enter_scores(key, scanned.scores)
 
     def enter_scores(self, key: frozenset[str], scores: Scores) -> None:
-        """Take the scores about a model, by its effects, into account."""
+        """Store the scores about a model.
+
+        Args:
+            key: effects of the model.
+            scores: the scores.
+        """
         self.scored[key] = scores
         self.tests[key] = scores.p_value
-        # Kept from the first scan, so that merits stay comparable when a better base fit turns up.
+        # Kept from the first scan, so that merits remain comparable after a better base fit.
         if not key and not self.chances:
             self.chances = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
 
     def _moved(self, one: Fit, other: Fit) -> float:
-        """How far two fits are apart where samples are, in sigmas, RMS."""
+        """Return the RMS difference of two fits at the samples, in sigmas."""
         apart = (one.simulated - other.simulated) / self.noise.sigma
         return float(np.sqrt(np.square(apart[self.seen]).mean()))
 
     def _lacking(self, model: Model) -> list[str]:
-        """The effects that a model lacks."""
+        """Return the effects that a model lacks."""
         held = set(model.names)
-        # Of an effect and one that it contains nothing would fix how they share what they explain.
+        # An effect and one that it contains have no unique solution together.
         for name in model.names:
             held.update(self.world.effects[name].contains)
         return [name for name in self.world.library if name not in held]
 
     def extend(self, beam: Iterable[Model], most: int, patient: bool = False) -> None:
-        """Refit the most promising extensions of some models; those that are known already only
-        with patience.
+        """Refit the most promising extensions of models; known ones only if patient.
+
+        Args:
+            beam: models to extend.
+            most: maximum number of candidates per model.
+            patient: whether to include all candidates, and fit the beginnings of the runs first.
         """
         starts = []
         models = list(beam)
-        # A better fit since then has taken the scores of some away.
+        # A better fit may have discarded the scores of some models.
         lost = [model for model in models if frozenset(model.names) not in self.scanned]
         self._survey(lost, beside=models)
         for model in models:
             key = frozenset(model.names)
             known = self.scanned[key]
-            # The model may have been fitted better since it was put into the beam.
+            # The model may have been improved since it was put into the beam.
             newest = self.models[key]
             further = nominated(
                 self.world,
@@ -227,7 +251,8 @@ class Scored(Models):
             if starts:
                 self.refit(starts, patient=patient)
             return
-        # Laws that are asked in every step cost most, and what they contain is often all there is.
+        # Laws that are evaluated in every step cost most, and the laws that they contain are often
+        # sufficient.
         names = {frozenset(start.effects) for start in starts} | set(self.models)
         parts = {id(start): self._contained(start) & names for start in starts}
         plain = [start for start in starts if not parts[id(start)]]
@@ -238,8 +263,11 @@ class Scored(Models):
             self.refit(richer)
 
     def _is_new(self, start: Start, model: Model) -> bool:
-        """Whether a fit may tell what none of these effects has: there is none, or, of a robot,
-        whose effects begin far away, it was caught behind a model that it contains.
+        """Return whether a fit from this start may find something new.
+
+        This is the case if no fit of these effects is known. For a robot, whose effects start far
+        from the optimum, it is also the case if the known fit is worse than a model that it
+        contains.
         """
         known = self.models.get(frozenset(start.effects))
         if known is None:
@@ -248,64 +276,75 @@ class Scored(Models):
         return self.world.linear and behind > CAUGHT
 
     def _contained(self, start: Start) -> set[frozenset[str]]:
-        """The models with what one of its effects contains in that one's place."""
+        """Return the models in which one effect is replaced by an effect that it contains."""
         own = frozenset(start.effects)
         effects = self.world.effects
         return {own - {name} | {part} for name in own for part in effects[name].contains}
 
     def _explained(self, keys: Iterable[frozenset[str]]) -> bool:
-        """Whether one of these models leaves no more than noise does."""
+        """Return whether one of these models leaves only noise."""
         models = [self.models[key] for key in keys if key in self.models]
         return any(self.quiet(m) and self.excess(m) < SILENT for m in models)
 
     def missing(self, model: Model, larger: Model) -> float:
-        """Probability that a model which lacks nothing would seem to gain as much by becoming the
-        larger one.
+        """Return the p-value of the gain of a larger model.
 
-        The surrogates have the colour of what the larger model leaves, which is closer to the noise
-        alone.
+        The null hypothesis is that the smaller model lacks nothing. The surrogates have the
+        spectrum of the larger model's residual, which is closer to pure noise.
+
+        Args:
+            model: the smaller model.
+            larger: the larger model.
         """
         gain = larger.likelihood.value - model.likelihood.value
         model = self.models[frozenset(model.names)]
         first = self.gained(self.scan(model), larger, gain)
-        # No colour of the surrogates makes such a gain a matter of chance.
+        # Such a gain is significant whatever the spectrum of the surrogates.
         if first < CERTAIN:
             return first
         scores = self.scan(model, self.residual(larger.fit))
         return min(scores.p_value, self.gained(scores, larger, gain))
 
     def gained(self, scores: Scores, larger: Model, gain: float) -> float:
-        """Chance of a gain in twice the log likelihood, less what chance gives the larger model's
-        effects.
+        """Return the p-value of a gain in twice the log-likelihood.
+
+        The null-hypothesis level of the larger model's effects is subtracted first.
+
+        Args:
+            scores: scores about the smaller model.
+            larger: the larger model.
+            gain: gain in twice the log-likelihood.
         """
         chance = dict(zip(scores.effects, scores.chance.tolist(), strict=True))
-        # Of several effects the one that gains most by chance counts.
+        # Among several effects, the highest null-hypothesis level is used.
         chances = [chance.get(name, 0.0) for name in larger.names]
         lucky = max(chances, default=0.0)
         excess = np.array([gain - lucky])
         return tail(scores.by_chance, excess)
 
     def plain(self, model: Model, doubt: float) -> bool:
-        """Whether nothing suggests that the model lacks something: neither a score nor the size of
-        what it leaves.
+        """Return whether neither scores nor residual suggest that the model lacks something.
+
+        Args:
+            model: the model.
+            doubt: p-value threshold of the scores.
         """
         return self.scan(model).p_value > doubt and self.quiet(model)
 
     def quiet(self, model: Model) -> bool:
-        """Whether what a model leaves may be noise: as small as the floor, or larger where the
-        floor is an estimate.
+        """Return whether the residual of a model may be noise.
 
-        The floor is estimated as if noise forgot itself; what is left may exceed it if it is of
-        first order.
+        It is at the noise floor, or it is above an estimated floor and AR(1) noise. The floor is
+        estimated for white noise, so AR(1) noise may exceed it.
         """
         left = np.nan_to_num(model.likelihood.sigma, nan=np.inf)
         loud = left >= LOUD * self.noise.sigma
         if not loud.any():
             return True
-        # Stated noise is known, so more than it is no noise, whatever its colour.
+        # Specified noise is known, so a larger residual is not noise, whatever its spectrum.
         if (loud & self.stated).any():
             return False
-        # The test of Ljung and Box, eq. (5) of `bench.gap.model.noise`.
+        # Ljung-Box test, eq. (5) of `bench.gap.model.noise`.
         residual = self.residual(model.fit)
         return forgets(residual, self.seen, model.likelihood) > FORGOT
 
@@ -319,7 +358,7 @@ def _scanned(
     seen: Mask,
     stream: np.random.Generator,
 ) -> Scanned:
-    """A model scored, whoever does it."""
+    """Score one model; runs in this process or in a worker."""
     candidates = directions(world, at, lacking)
     test = ScoreTest(at, candidates, seen, weights)
     return Scanned(at, candidates, test, _scored(test, residual, residual, seen, stream))
@@ -328,7 +367,7 @@ def _scanned(
 def _scored(
     test: ScoreTest, residual: Array, against: Array, seen: Mask, stream: np.random.Generator
 ) -> Scores:
-    """Scores of a residual, with surrogates of the colour of another one."""
+    """Return the scores of a residual, with surrogates that have the spectrum of `against`."""
     return calibrated(
         test,
         residual,

@@ -1,7 +1,7 @@
-"""Fits what the search ended with, and its rivals, to the end, before anything is named.
+"""Refit the model found by the search and its close rivals to convergence.
 
-The search asks few candidates about each model and stops fits that fall behind; a cause that it
-names must stand against all of them, each at its own best.
+The search tests few candidates about each model, and stops fits that fall behind. A diagnosed cause
+must be compared with all rivals, each at its own optimum.
 """
 
 from __future__ import annotations
@@ -16,50 +16,57 @@ from bench.gap.model.noise import Noise
 from bench.gap.model.problem import Start
 
 NEAR = 30.0
-"""Rivals this near in twice the log likelihood are fitted once more before they are judged."""
+"""Maximum difference in twice the log-likelihood (merit) of rivals that are refitted."""
 NEARLY = 1.5
-"""So are those that leave less than so many times the model's excess over the noise."""
+"""Maximum excess of rivals that are refitted, as a multiple of the excess of the model."""
 
 
 def settle(search: Search, model: Model) -> Model:
-    """The best model after it and its rivals of the same size, all that are promising, were fitted
-    to the end.
+    """Refit a model and its promising rivals of the same size to convergence.
 
-    By generalised least squares where what is left is noise; by ordinary ones where structure is
-    left, which is none and would pull the fit away from the data.
+    If the residual is noise, generalised least squares is used. If it has structure, ordinary least
+    squares is used, because the structure is not noise and would distort the fit.
+
+    Args:
+        search: the search, with all fitted models.
+        model: the model that the search found.
+
+    Returns:
+        The best of these models.
     """
     size = len(model.names)
     if search.settled != frozenset(model.names):
         model = _among_all(search, model)
     around = list(neighbours(search.world, model.fit))
-    # What repeats has minima by the dozen.
+    # Periodic effects have dozens of local minima.
     if around:
         search.from_pieces(size)
     near = rivals(search, model)
     parts = smaller(search, model)
     noise = _noise_of(search, model)
     judged = [model]
-    # Where structure is left merits only compare how each model mimics it, so none takes its place.
+    # With structure in the residual, merit only compares how well models mimic it, so no rival
+    # replaces the model.
     if noise is not None:
         judged = [m for m in near if abs(model.merit - m.merit) < NEAR] or [model]
     starts = [m.fit.start() for m in near]
     starts += [m.fit.start() for m in parts]
     starts += [_in_its_place(search, model, m) for m in judged if _differs_in_one(model, m)]
     search.refit([*starts, *around], noise)
-    # A refit that ends worse than before is not kept, so the table holds the best of each.
+    # A refit that ends worse is not stored, so the table contains the best fit of each model.
     refitted = [search.models[frozenset(m.names)] for m in judged]
     return max(refitted, key=lambda m: m.merit)
 
 
 def _among_all(search: Search, model: Model) -> Model:
-    """The best of a model and those that have any other effect of the library in place of one."""
+    """Return the best among a model and all models with one effect replaced by any other."""
     size = len(model.names)
     known = set(search.models)
     smaller = [search.without(model, name) for name in model.names]
     search.extend(smaller, len(search.world.library))
     best = model
     for key, other in search.models.items():
-        # Those that were known have been compared with it by the search.
+        # The search has already compared the known models.
         if key in known or len(key) != size:
             continue
         if other.merit > best.merit:
@@ -68,13 +75,15 @@ def _among_all(search: Search, model: Model) -> Model:
 
 
 def _differs_in_one(model: Model, other: Model) -> bool:
-    """Whether it has one other effect, and shares others."""
+    """Return whether two models share at least one effect and differ in exactly one."""
     return len(model.names) > 1 and len(set(model.names) - set(other.names)) == 1
 
 
 def _in_its_place(search: Search, model: Model, other: Model) -> Start:
-    """Where a rival begins with all that it shares as the model has it: a law of several numbers
-    ends a little elsewhere each time, and what is alike would be told apart by that.
+    """Return a start for a rival in which all shared effects have the values of the model.
+
+    A law with several coefficients converges to slightly different values each time, which would
+    make equivalent models look different.
     """
     (own,), (gone,) = (set(m.names) - set(n.names) for m, n in ((other, model), (model, other)))
     slots = search.world.slots
@@ -85,7 +94,12 @@ def _in_its_place(search: Search, model: Model, other: Model) -> Start:
 
 
 def rivals(search: Search, model: Model) -> list[Model]:
-    """Models of as many effects that explain nearly as much, the model itself among them."""
+    """Return models with as many effects that explain the data nearly as well, including the model.
+
+    Args:
+        search: the search, with all fitted models.
+        model: the model to compare with.
+    """
     size = len(model.names)
     return [
         other
@@ -95,14 +109,22 @@ def rivals(search: Search, model: Model) -> list[Model]:
 
 
 def _is_near(search: Search, other: Model, model: Model) -> bool:
-    """By merit, or by what is left over the noise: merit is misled where structure is left."""
+    """Return whether two models are close in merit or in excess.
+
+    Merit is misleading if the residual has structure.
+    """
     if abs(model.merit - other.merit) < NEAR:
         return True
     return search.excess(other) < NEARLY * search.excess(model)
 
 
 def smaller(search: Search, model: Model) -> list[Model]:
-    """The models without one of the effects: the gain of each is measured against them."""
+    """Return the models without one of the effects, from which the gain of each is measured.
+
+    Args:
+        search: the search, with all fitted models.
+        model: the larger model.
+    """
     names = set(model.names)
     size = len(names) - 1
     smaller = []
@@ -113,9 +135,9 @@ def smaller(search: Search, model: Model) -> list[Model]:
 
 
 def _noise_of(search: Search, model: Model) -> Noise | None:
-    """The noise that a model leaves, to weigh samples with; None where it leaves structure."""
+    """Return the noise of the residual of a model; None if the residual has structure."""
     if remains(search, model).structure:
         return None
     sigma = np.maximum(model.likelihood.sigma, 1e-300)
-    # As in the score test, correlations are never negative.
+    # Correlations are never negative, as in the score test.
     return Noise(sigma, np.maximum(model.likelihood.phi, 0.0))

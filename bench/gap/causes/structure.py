@@ -1,18 +1,18 @@
-"""Is there structure that no effect of the library accounts for?
+"""Lack-of-fit test: structure in the residual that no effect of the library explains.
 
-Two tests. Where the recording states its noise, what a model leaves must not exceed it. And whether
-or not it does, a force of any shape must not help: hats over time, position and speed, along each
-axis and against the motion, stand for causes that nobody has thought of (a nonparametric
-lack-of-fit test; J. D. Hart, Nonparametric Smoothing and Lack-of-Fit Tests, 1997,
-doi:10.1007/978-1-4757-2722-7), calibrated by surrogates as the library is.
+There are two tests. If the recording specifies its noise, the residual must not exceed it. In any
+case, an additional force of any shape must not improve the fit. Hat basis functions over time,
+position and speed, along each axis and against the motion, represent unknown causes (a
+nonparametric lack-of-fit test; J. D. Hart, Nonparametric Smoothing and Lack-of-Fit Tests, 1997,
+doi:10.1007/978-1-4757-2722-7). The test is calibrated by surrogates, like the score test.
 
 A hat of width w around a centre m of a variable z (time, position or speed) is a force
 
     f(z) = c max(1 - |z - m| / w, 0) d                                                         (1)
 
-with d its direction. Neighbours overlap by half, so the sum of a family over one variable is any
-force that is linear between `BINS` knots. How well sigma is known that is estimated from n samples
-of noise with a correlation phi between neighbours is (M. S. Bartlett's formula of 1946 at lag 0)
+with direction d. Neighbouring hats overlap by half, so the sum of a family over one variable is any
+piecewise linear force with `BINS` knots. If sigma is estimated from n samples of AR(1) noise with
+correlation phi, its relative standard error is (formula of M. S. Bartlett, 1946, at lag 0)
 
     sd(sigma) / sigma = sqrt((1 + phi^2) / (1 - phi^2) / (2 n))                                (2)
 """
@@ -39,34 +39,35 @@ from sims.simulated import Simulated
 from sims.system import Coefficient, Effect, Force, Moment
 
 BINS = 7
-"""Hats over the range of a variable."""
+"""Number of hats over the range of a variable."""
 SURROGATES = 150
-"""Residuals that mean nothing, drawn to calibrate the hats."""
+"""Number of surrogate residuals that calibrate the test."""
 SLOW = 0.05
-"""Share of a speed that is seldom exceeded over which dry friction turns its sign."""
+"""Speed over which dry friction reverses its sign, as a share of the high speed of the runs."""
 SIZE = 1e-4
-"""Strength of a simulated hat as a share of a typical force: its response is linear there."""
+"""Strength of a simulated hat, as a share of a typical force; the response is linear there."""
 TYPICAL = {"point": 2.0, "linear": 5.0, "rotary": 0.5}
-"""A typical force of each kind of system: m/s^2, N, N m."""
+"""Typical force of each kind of system: m/s^2 for point, N for linear, N m for rotary."""
 
 AGAINST = 0
-"""Direction of a hat: against the motion, in proportion to speed."""
+"""Direction of a hat: against the motion, proportional to speed."""
 DRY = 1
-"""Against the motion, whatever the speed."""
+"""Direction of a hat: against the motion, independent of speed."""
 ALONG = 2
-"""Along the first axis; the others follow."""
+"""Direction of a hat: along the first axis; larger numbers are the other axes."""
 
 TIME = 0
 """Variable of a hat: time."""
 SPEED = 1
-"""Speed."""
+"""Variable of a hat: speed."""
 POSITION = 2
-"""The first coordinate; the others follow."""
+"""Variable of a hat: the first coordinate; larger numbers are the other coordinates."""
 
 
 class Hat(Force):
-    """A force over a stretch of time, position or speed: along an axis, against the motion, or as
-    dry friction.
+    """A force within an interval of time, position or speed.
+
+    It acts along an axis, against the motion, or as dry friction.
     """
 
     name = "probe.hat"
@@ -78,17 +79,17 @@ class Hat(Force):
     )
 
     def force(self, c: Array, moment: Moment) -> Array:
-        """Strength times a triangle around the centre."""
+        """Return strength times a triangle around the centre, eq. (1)."""
         strength, variable, centre, width, direction, slow = c
         axes = moment.x.shape[1]
         variables = [moment.t, moment.speed, *(moment.x[:, k, None] for k in range(axes))]
-        # The lanes of one call differ in what a hat follows, and every lane has exactly one.
+        # The batch elements of one call follow different variables; each element has exactly one.
         value = sum(np.where(variable == i, one, 0.0) for i, one in enumerate(variables))
-        # Off, a hat has no width either, and must not divide by it.
+        # A hat that is off has zero width, which must not be a divisor.
         reach = np.maximum(width, 1e-12)
         distance = np.abs(value - centre) / reach
         height = np.maximum(1.0 - distance, 0.0)  # (1)
-        # Smooth in the speed, so that no step has to be shortened where the motion turns.
+        # The force is smooth in the speed, so no step must be shortened where the motion reverses.
         dry = -moment.v / (moment.speed + np.maximum(slow, 1e-9))
         ways = [-moment.v, dry, *(np.eye(axes)[axis] for axis in range(axes))]
         chosen = sum(np.where(direction == i, way, 0.0) for i, way in enumerate(ways))
@@ -98,15 +99,14 @@ class Hat(Force):
 
 @dataclass(frozen=True)
 class Remains:
-    """What a model leaves unexplained.
+    """Result of the lack-of-fit test of a model.
 
     Attributes:
-        p_value: chance of the best force of any shape where nothing is missing; 1 where the test
-            does not apply.
-        where: what that force follows, e.g. ``position x``.
-        excess: (C,) RMS left in units of the noise floor.
-        loud: names of channels whose noise is exceeded.
-        chance: below which the p value counts.
+        p_value: p-value of the best force of any shape; 1 if the test does not apply.
+        where: variable of that force, e.g. ``position x``.
+        excess: (C,) RMS residual in units of the noise floor.
+        loud: names of channels whose residual exceeds their noise.
+        chance: p-value threshold of the test.
     """
 
     p_value: float
@@ -117,21 +117,21 @@ class Remains:
 
     @property
     def structure(self) -> bool:
-        """Whether there is structure left."""
+        """Whether the residual has structure."""
         return has_structure(self.p_value, self.chance, self.loud)
 
 
 def probes(kind: type[Simulated]) -> list[type[Effect]]:
-    """The effects that stand for forces of any shape on a simulator of this kind."""
+    """Return the hat effects for lack-of-fit tests of this kind of simulator."""
     return [JointHat] if kind.has_model else [Hat]
 
 
 def remains(models: Models, model: Model) -> Remains:
-    """Test what a fitted model leaves.
+    """Test a fitted model for lack of fit.
 
     Args:
-        models: among which the model is.
-        model: the model.
+        models: the models of the recording.
+        model: the fitted model.
     """
     world, stated = models.world, models.stated
     quick = unasked(models, model)
@@ -140,7 +140,7 @@ def remains(models: Models, model: Model) -> Remains:
     world.watch.look("a force of any shape")
     known = models.force_of_any_shape(model)
     level = level_of(bool(stated.all()))
-    # The innovations are linear in such a force; where they show one, it is simulated.
+    # The linear innovations test decides if it finds no force; otherwise the force is simulated.
     if known is not None and known[0] > level:
         return Remains(known[0], known[1], quick.excess, quick.loud, level)
     model = models.exact(model)
@@ -162,9 +162,14 @@ def remains(models: Models, model: Model) -> Remains:
 
 
 def unasked(models: Models, model: Model) -> Remains:
-    """What a fitted model leaves by its size alone, no force of any shape asked."""
+    """Test only the size of the residual, without a force of any shape.
+
+    Args:
+        models: the models of the recording.
+        model: the fitted model.
+    """
     sigma = model.likelihood.sigma
-    # A channel without samples has no sigma, and leaves nothing.
+    # A channel without samples has no sigma and no residual.
     left = np.where(np.isfinite(sigma), sigma, 0.0)
     excess = left / models.noise.sigma
     channels = []
@@ -176,10 +181,8 @@ def unasked(models: Models, model: Model) -> Remains:
 
 
 def _error(models: Models, model: Model, channel: int) -> float:
-    """Standard error of a channel's sigma, as a share of it: fewer samples count where noise
-    remembers.
-    """
-    # At a correlation of one the formula knows nothing, and every channel would be quiet.
+    """Return the relative standard error of the sigma of a channel, eq. (2)."""
+    # At a correlation of one, the formula diverges, and no channel would exceed its noise.
     phi = min(abs(float(model.likelihood.phi[channel])), 0.99)
     count = max(int(models.seen[:, :, channel].sum()), 2)
     square = phi * phi
@@ -188,26 +191,31 @@ def _error(models: Models, model: Model, channel: int) -> float:
 
 
 def hats(world: World, model: Model) -> Directions:
-    """What hats over every recorded variable would change about a model."""
+    """Compute the responses of a model to hats over every recorded variable.
+
+    Args:
+        world: the runs.
+        model: the fitted model.
+    """
     probes, size = hat_probes(world)
     names = [JointHat.name if JointHat.name in world.slots else Hat.name] * len(probes)
     added = [(name, probe.c) for name, probe in zip(names, probes, strict=True)]
     changed = changes_by(world, model.fit, added)
     values = np.nan_to_num(np.moveaxis(changed, 0, -1)) / size
-    # A hat where no run ever is changes nothing, and would be a column of zeros.
+    # A hat outside the range of all runs changes nothing and would be a column of zeros.
     acting = np.flatnonzero(np.abs(values).max(axis=(0, 1, 2)) > 0)
     return Directions(tuple(probes[i] for i in acting), values[..., acting])
 
 
 def hat_probes(world: World) -> tuple[list[Probe], float]:
-    """Hats over every recorded variable, and the strength that they have.
+    """Return hats over every recorded variable, and their strength.
 
-    One label for a family: its hats are one hypothesis, and act together.
+    All hats of a family have the same label, because they form one hypothesis and act together.
     """
     size = SIZE * TYPICAL[world.simulator.system.kind]
     probes = []
     for label, low, high, coefficients in _shapes(world, size):
-        # At this spacing each hat reaches to the centres of its neighbours.
+        # With this spacing, each hat extends to the centres of its neighbours.
         width = (high - low) / (BINS - 1)
         for centre in np.linspace(low, high, BINS):
             _, c = coefficients(centre, width)
@@ -216,11 +224,11 @@ def hat_probes(world: World) -> tuple[list[Probe], float]:
 
 
 Shape = Callable[[float, float], tuple[str, Array]]
-"""A hat of a family by its centre and width: the effect's name, and its coefficients."""
+"""Function from the centre and width of a hat to the name of its effect and its coefficients."""
 
 
 def _shapes(world: World, size: float) -> Iterator[tuple[str, float, float, Shape]]:
-    """Families of hats: the label, the range of the variable, and what makes one of them."""
+    """Yield families of hats: label, range of the variable, and a function that creates one hat."""
     if JointHat.name in world.slots:
         for joint in joint_families(world, SLOW):
             yield joint.label, joint.low, joint.high, partial(_on_joint, joint, size)
@@ -231,6 +239,7 @@ def _shapes(world: World, size: float) -> Iterator[tuple[str, float, float, Shap
 
 
 def _on_joint(family: JointFamily, size: float, centre: float, width: float) -> tuple[str, Array]:
+    """Return the effect name and the coefficients of one hat on a joint."""
     follows = family.joint, family.variable, centre, width, family.direction, family.slow
     return JointHat.name, np.array([size, *follows])
 
@@ -238,6 +247,7 @@ def _on_joint(family: JointFamily, size: float, centre: float, width: float) -> 
 def _anywhere(
     family: _Family, size: float, slow: float, centre: float, width: float
 ) -> tuple[str, Array]:
+    """Return the effect name and the coefficients of one hat on a system without joints."""
     return Hat.name, np.array([size, family.variable, centre, width, family.direction, slow])
 
 
@@ -252,13 +262,14 @@ class _Family(NamedTuple):
 
 
 def _families(world: World) -> Iterator[_Family]:
-    """Every family of hats that the recording can show."""
+    """Yield every family of hats that the recording can show."""
     yield from _over_time(world)
     yield from _over_positions(world)
     yield from _over_speed(world)
 
 
 def _over_time(world: World) -> Iterator[_Family]:
+    """Yield families of hats over time."""
     durations = []
     for track in world.tracks:
         times = track.scenario.times
@@ -271,8 +282,9 @@ def _over_time(world: World) -> Iterator[_Family]:
 
 
 def _over_positions(world: World) -> Iterator[_Family]:
+    """Yield families of hats over each recorded coordinate."""
     system = world.simulator.system
-    # What bounces flies free: there is nothing that it slides on, and its height comes last.
+    # A bouncing body flies freely and slides on nothing; its last coordinate is the height.
     free, last = system.bounces, len(system.coordinates) - 1
     for axis, name in enumerate(system.coordinates):
         if name not in world.channels:
@@ -291,6 +303,7 @@ def _over_positions(world: World) -> Iterator[_Family]:
 
 
 def _over_speed(world: World) -> Iterator[_Family]:
+    """Yield families of hats over the speed."""
     speed = _fastest(world)
     if speed > 0:
         yield _Family("speed, against the motion", SPEED, AGAINST, 0.0, speed)
@@ -299,7 +312,7 @@ def _over_speed(world: World) -> Iterator[_Family]:
 
 
 def _fastest(world: World) -> float:
-    """A speed that is seldom exceeded, from the recorded coordinates."""
+    """Return the 98 % quantile of the speed, from the recorded coordinates."""
     squares = []
     for name in world.simulator.system.coordinates:
         if name not in world.channels:
@@ -308,11 +321,11 @@ def _fastest(world: World) -> float:
         rates = [np.zeros(1)]
         for track in world.tracks:
             if len(track.observed) > 3:
-                # Every third sample: differences of neighbours are mostly noise.
+                # Use every third sample, because differences of neighbours are mostly noise.
                 step = np.diff(track.scenario.times[::3])
                 rates.append(np.diff(track.observed[::3, c]) / step)
         squares.append(np.square(np.concatenate(rates)))
-    # A system whose coordinates are not recorded has no speed to lay hats over.
+    # Without recorded coordinates there is no speed.
     if not squares:
         return 0.0
     speed = np.nanquantile(sum(squares), 0.98)

@@ -1,5 +1,6 @@
-"""Sums over samples from which products come that are whitened by any correlation: eq. (1) of
-`bench.gap.causes.products`.
+"""Sums of products of neighbouring samples, for whitening at any AR(1) correlation.
+
+They give the products of eq. (1) of `bench.gap.causes.products`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,13 @@ from sims.base import Array
 
 
 class Parts(NamedTuple):
-    """The three sums that eq. (1) puts together, each an array of products."""
+    """The three sums of eq. (1), each an array of products.
+
+    Attributes:
+        whole: products of equal samples.
+        mixed: products of each sample with its neighbours.
+        ends: products of samples without a neighbour, times the number of missing neighbours.
+    """
 
     whole: Array
     mixed: Array
@@ -22,11 +29,11 @@ class Parts(NamedTuple):
 
     @staticmethod
     def of(*shape: int) -> Parts:
-        """Nothing yet, to be added to."""
+        """Return sums of zeros with the given shape."""
         return Parts(np.zeros(shape), np.zeros(shape), np.zeros(shape))
 
     def at(self, phi: float) -> Array:
-        """The products after whitening by a correlation."""
+        """Return the products after whitening with the given correlation."""
         square = phi * phi
         follow = (1.0 + square) * self.whole - phi * self.mixed - square * self.ends
         result: Array = follow / (1.0 - square)  # (1)
@@ -34,13 +41,14 @@ class Parts(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A stretch of a run.
+    """A section of a run.
 
     Attributes:
-        run: which.
-        begin, end: its samples.
-        edge: which of them lack a neighbour, all channels in a row.
-        lacking: (m,) how many each of those lacks.
+        run: index of the run.
+        begin: first sample.
+        end: end of the samples (exclusive).
+        edge: (m,) indices of the samples that lack a neighbour, all channels in one row.
+        lacking: (m,) number of missing neighbours of each of these samples.
     """
 
     run: int
@@ -51,12 +59,12 @@ class Place(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Columns over a stretch in sigmas, all channels in a row.
+    """Columns over a section of a run in sigmas, all channels in one row.
 
     Attributes:
         now: (k, n) the samples.
-        near: (k, n) those before and behind each, added.
-        edge: (k, m) those that lack a neighbour.
+        near: (k, n) sum of the previous and the next sample of each sample.
+        edge: (k, m) the samples that lack a neighbour.
     """
 
     now: Array
@@ -65,29 +73,43 @@ class Columns(NamedTuple):
 
 
 def lacking(seen: Mask) -> Array:
-    """(R, T, C) how many of its two neighbours each sample lacks that is there."""
+    """Return the number of missing neighbours (R, T, C) of each available sample."""
     lacking = np.full(seen.shape, 2.0)
     lacking[:, 1:] -= seen[:, :-1]
     lacking[:, :-1] -= seen[:, 1:]
-    # Behind a gap noise starts anew: what it remembers of before is not known.
+    # Missing samples count as zero: AR(1) noise restarts after a gap, because earlier noise is not
+    # known.
     return np.where(seen, lacking, 0.0)
 
 
 def part_of(parts: Parts, run: int) -> Parts:
-    """Those of one run, where they are kept."""
+    """Return the sums of one run, from sums that are stored for each run."""
     return Parts(*(values[run] for values in parts))
 
 
 def gather(parts: Parts, some: Columns, others: Columns, place: Place) -> None:
-    """Add the products of all columns of some with all of others."""
+    """Add the products of all columns of one set with all columns of another.
+
+    Args:
+        parts: sums to add to, in place.
+        some: columns of the first set.
+        others: columns of the second set.
+        place: the section of the run.
+    """
     parts.whole[...] += some.now @ np.swapaxes(others.now, -1, -2)
-    # Summed over a run it makes no difference on which side the neighbours are.
+    # Summed over a run, it does not matter to which of the two columns the neighbours belong.
     parts.mixed[...] += some.now @ np.swapaxes(others.near, -1, -2)
     parts.ends[...] += (some.edge * place.lacking) @ np.swapaxes(others.edge, -1, -2)
 
 
 def add_squares(parts: Parts, some: Columns, place: Place) -> None:
-    """Add the products of columns with themselves."""
+    """Add the products of columns with themselves.
+
+    Args:
+        parts: sums to add to, in place.
+        some: the columns.
+        place: the section of the run.
+    """
     parts.whole[...] += np.einsum("kn,kn->k", some.now, some.now)
     parts.mixed[...] += np.einsum("kn,kn->k", some.near, some.now)
     parts.ends[...] += np.einsum("km,km,m->k", some.edge, some.edge, place.lacking)

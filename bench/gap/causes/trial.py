@@ -1,10 +1,10 @@
-"""What held-out runs say about the models of a search: they have a veto and a voice.
+"""Validation of the models of a search on held-out runs.
 
-Where runs are too few to hold one out, each is predicted by fits to the others
-(`bench.gap.cross_validation`), and counts as held out.
-
-An effect that makes them worse goes. A gap that only they show is something that the model has not
-learnt. And between models that explain the fitted runs alike, their likelihood counts too.
+If there are too few runs to hold one out, each run is predicted by fits to the others
+(`bench.gap.cross_validation`), and counts as held out. An effect that makes held-out predictions
+worse is dropped. A discrepancy that only held-out runs show is something that the model does not
+contain. Between models that explain the fitted runs equally well, the held-out likelihood counts,
+too.
 """
 
 from __future__ import annotations
@@ -22,38 +22,39 @@ from bench.gap.model.models import Model, Names
 from sims.base import Array
 
 CLEARLY_CLOSED = 0.5
-"""Share of the excess of fitted runs below which an effect must bring it, to be kept though it is
-hardly seen in that of held-out runs.
+"""Maximum excess on fitted runs, as a share of that without the effect, to keep the effect.
+
+It applies to an effect that improves the held-out runs only slightly.
 """
 RICHER = 8
-"""So many of the nearest models that contain what was found are tried on held-out runs."""
+"""Maximum number of models that contain the result and are evaluated on held-out runs."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Models on held-out runs.
+    """Models evaluated on held-out runs.
 
     Attributes:
         runs: predicts the held-out runs, or each run by cross-validation.
-        measured: the models that were tried there, by their effects.
+        measured: evaluated models, by their effects.
     """
 
     runs: Validation
     measured: dict[Names, Measured] = field(default_factory=dict)
 
     def measure(self, models: Iterable[Model]) -> None:
-        """Try models, all at once: each is compared with the nearest of them."""
-        # By effects, so that a model that is asked for twice is simulated once.
+        """Evaluate models together; each starts from the initial states of the nearest one."""
+        # Stored by effects, so that a repeated model is simulated only once.
         chosen = {model.names: model for model in models}
         results = self.runs.validate([model.fit for model in chosen.values()])
         self.measured.update(zip(chosen, results, strict=True))
 
     def excess(self, names: Names, sigma: Array | None = None) -> float:
-        """RMS of what a model leaves of the held-out runs in units of the noise, less one.
+        """Return the RMS residual of a model on the held-out runs in units of the noise, minus one.
 
         Args:
-            names: its effects; it has been measured.
-            sigma: (C,) the noise; that of the runs if None.
+            names: effects of a model that has been evaluated.
+            sigma: (C,) noise; None for the noise of the runs.
         """
         runs = self.runs
         noise = runs.noise.sigma if sigma is None else sigma
@@ -63,35 +64,42 @@ class Trial:
         return float(np.sqrt(squares.mean())) - 1.0
 
     def without_idle(self, search: Search, model: Model) -> Model:
-        """The model without effects that make held-out runs worse, or hardly better while much is
-        left of the gap.
+        """Return the model without idle effects.
+
+        An effect is idle if it makes held-out predictions worse, or hardly better while the excess
+        is large.
+
+        Args:
+            search: the search, with every fitted model.
+            model: the model.
         """
         while model.names and model.names in self.measured:
             smaller = self._smaller(search, model)
             idle = [m for m in smaller if not self._helps(search, m, model)]
             if not idle:
                 return model
-            # Of several that could go, the one goes without which held-out runs are best.
+            # If several effects are idle, drop the one without which held-out runs are predicted
+            # best.
             model = max(idle, key=lambda m: self.measured[m.names].merit)
         return model
 
     def richer(self, search: Search, model: Model) -> Model:
-        """Of the accounts that keep what was found and have more, the one that held-out runs bear
-        out best; the model itself where they bear out none.
+        """Return the extension of a model that held-out runs confirm best, or the model itself.
 
-        Where structure is left, merits say little of what the fitted runs show, since each model
-        mimics what none has. What leaves clearly less of runs that no fit has seen mimics nothing.
+        If the residual has structure, merits on fitted runs are unreliable, because each model
+        mimics what is missing. A clearly lower residual on runs that were not fitted is not
+        mimicry.
 
         Args:
-            search: with every model that was fitted.
-            model: what was found; it has been measured.
+            search: the search, with every fitted model.
+            model: the model that was found; it has been evaluated.
         """
         names = set(model.names)
         fuller = [m for m in search.models.values() if names < set(m.names)]
         fuller = sorted(fuller, key=lambda m: m.fit.cost)[:RICHER]
         known = search.models.values()
         parts = [m for m in known if any(set(m.names) < set(other.names) for other in fuller)]
-        # The model again, so that initial states of all are begun from the same ones.
+        # The model is included again, so that all initial states start from the same values.
         self.measure([model, *fuller, *parts])
         borne = {m.names: self._share(search, model, m) for m in fuller}
         best = min(fuller, key=lambda m: borne[m.names], default=model)
@@ -101,8 +109,10 @@ class Trial:
         return lean if names < set(lean.names) else model
 
     def _share(self, search: Search, model: Model, fuller: Model) -> float:
-        """How much a fuller account leaves, by what further effects have to bring: one where it is
-        just enough, on the fitted or the held-out runs, whichever show it less.
+        """Return the excess of a larger model relative to what its further effects must achieve.
+
+        The value is one if the reduction is just enough; the worse of fitted and held-out runs
+        counts.
         """
         enough = IDLE ** (len(fuller.names) - len(model.names))
         fitted = ratio_of(search.excess(fuller), search.excess(model))
@@ -110,12 +120,12 @@ class Trial:
         return max(fitted, unseen) / enough
 
     def _smaller(self, search: Search, model: Model) -> list[Model]:
-        """Models that were tried and lack one of the model's effects."""
+        """Return the evaluated models that lack one of the effects of the model."""
         names = set(model.names)
         size = len(names) - 1
         smaller = []
         for other in search.models.values():
-            # What was not tried on held-out runs has no voice there.
+            # A model that was not evaluated on held-out runs cannot be compared there.
             if other.names not in self.measured:
                 continue
             if len(other.names) == size and set(other.names) < names:
@@ -123,30 +133,36 @@ class Trial:
         return smaller
 
     def _helps(self, search: Search, without: Model, having: Model) -> bool:
-        """Whether the effect by which two models differ makes held-out runs better; or explains the
-        fitted ones, where held-out runs hardly show it.
+        """Return whether the effect by which two models differ improves held-out predictions.
+
+        It is also accepted if it explains the fitted runs, and held-out runs hardly show it.
         """
         before = self.measured[without.names].merit
         after = self.measured[having.names].merit
-        # Both are asked: far from the noise a merit alone may be mimicry.
+        # Both merit and excess are tested, because far from the noise merit alone may be mimicry.
         excesses = self.excess(without.names), self.excess(having.names)
         if helps((before, after), excesses):
             return True
         left, closed = search.excess(without), search.excess(having)
-        # Errors of a motion without feedback add up, whatever makes them.
+        # Errors of a motion without feedback accumulate, whatever their cause.
         better = after > before + SWITCH and excesses[1] < excesses[0]
         if better and closed < CLEARLY_CLOSED * left:
             return True
-        # A limit that no held-out run comes near has no voice there: chance would speak for it.
+        # A limit that no held-out run approaches cannot be tested there; the result would be
+        # random.
         faint = max(excesses) < NOTICED and is_alike(before - after)
         return faint and left > NOTICED and explains((left - closed) / left)
 
     def misses(self, model: Model, left: Remains) -> bool:
-        """Whether held-out runs show a gap that the model does not close: something acts there that
-        it has not learnt.
+        """Return whether held-out runs show a discrepancy that the model does not remove.
+
+        Args:
+            model: the model, which has been evaluated.
+            left: its lack-of-fit result.
         """
         own = np.nan_to_num(model.likelihood.sigma)
-        # What is left of fitted runs is noise where it has no structure; else only the floor is.
+        # The residual of fitted runs is noise if it has no structure; otherwise only the noise
+        # floor is.
         known = np.where(left.structure, 0.0, own)
         noise = np.maximum(self.runs.noise.sigma, known)
         before = self.excess((), noise)

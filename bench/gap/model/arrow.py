@@ -1,27 +1,26 @@
-"""One damped Gauss-Newton step for parameters that all runs share and initial states that each run
-has for itself.
+"""Damped Gauss-Newton step for parameters that all runs share and initial states of each run.
 
-Run i leaves a residual r_i, which the shared parameters x change by A_i and the run's own initial
-state z_i by B_i; of z_i a guess g is known beforehand to within π, 1 sigma. The cost is
+Run i has the residual r_i. The shared parameters x change it by A_i, and the initial state z_i of
+the run changes it by B_i. The prior of z_i has mean g_i and standard deviation π. The cost is
 
     F = Σ_i |r_i|² + Σ_i |d_i|²,   d_i = (z_i - g_i) / π                                         (1)
 
-A Gauss-Newton step takes r for linear. As no run's initial state touches another run, its normal
-equations have the shape of an arrow (B. Triggs et al., Bundle adjustment, 2000,
-doi:10.1007/3-540-44480-7_21, section 6), here with U = Σ A_iᵀ A_i, W_i = A_iᵀ B_i and
-V_i = B_iᵀ B_i + π⁻²:
+A Gauss-Newton step linearises r. The initial state of a run does not influence other runs, so the
+normal equations have arrowhead structure (B. Triggs et al., Bundle adjustment, 2000,
+doi:10.1007/3-540-44480-7_21, section 6), here with U = Σ A_iᵀ A_i, W_i = A_iᵀ B_i and V_i = B_iᵀ
+B_i + π⁻²:
 
     U δx + Σ_i W_i δz_i = a,          a = Σ A_iᵀ r_i                                             (2)
     W_iᵀ δx + V_i δz_i = b_i,         b_i = B_iᵀ r_i - d_i / π                                   (3)
 
-Levenberg and Marquardt damp it: U and V_i get λ times their own diagonals on top (J. Nocedal, S. J.
-Wright, Numerical Optimization, 2nd ed., section 10.3). Initial states are eliminated run by run,
-which leaves the Schur complement for the shared parameters, and then follow from them:
+Levenberg-Marquardt damping adds λ times their own diagonals to U and V_i (J. Nocedal, S. J. Wright,
+Numerical Optimization, 2nd ed., section 10.3). Initial states are eliminated run by run. This
+leaves the Schur complement for the shared parameters, from which the initial states follow:
 
     (U - Σ W_i V_i⁻¹ W_iᵀ) δx = a - Σ W_i V_i⁻¹ b_i                                              (4)
     δz_i = V_i⁻¹ b_i - V_i⁻¹ W_iᵀ δx                                                             (5)
 
-so the work grows linearly with the number of runs. If r were linear, (1) would fall by
+The work therefore grows linearly with the number of runs. If r were linear, (1) would decrease by
 
     Σ |r_i|² - |r_i - A_i δx - B_i δz_i|² + Σ |d_i|² - |d_i + δz_i / π|²                         (6)
 """
@@ -36,16 +35,22 @@ from bench.gap.model.noise import Mask
 from sims.base import Array
 
 LEAST_POWER = 1e-12
-"""Stands for a diagonal element of U that is zero, so that it is damped at all."""
+"""Minimum diagonal element of U, so that unknowns without any response are damped."""
 RIDGE = 1e-9
-"""Share of its diagonal that U gets besides the damping: undamped, parameters that act alike make
-it singular."""
+"""Share of its diagonal that is always added to U.
+
+Without it, parameters with the same response would make U singular if there is no damping.
+"""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A step to try: of the shared parameters (q,), of the initial states (R, s), and the decrease
-    of the cost that it promises.
+    """A step to try.
+
+    Attributes:
+        shared: (q,) step of the shared parameters.
+        own: (R, s) step of the initial states.
+        promised: predicted decrease of the cost.
     """
 
     shared: Array
@@ -59,10 +64,10 @@ class _Arrow:
 
     Attributes:
         shared: (q, q) U.
-        cross: (R, q, s) every W_i.
-        inner: (R, s, s) every V_i.
+        cross: (R, q, s) all W_i.
+        inner: (R, s, s) all V_i.
         gradient: (q,) a.
-        pull: (R, s) every b_i.
+        pull: (R, s) all b_i.
     """
 
     shared: Array
@@ -72,27 +77,28 @@ class _Arrow:
     pull: Array
 
     def solved(self, stuck: Mask) -> tuple[Array, Array]:
-        """The steps (q,) and (R, s), by (4) and (5); stuck parameters (q,) do not move."""
+        """Solve (4) and (5) for the steps (q,) and (R, s); stuck parameters (q,) do not move."""
         schur, inverse_cross = schur_complement(self.shared, self.cross, self.inner)
-        # V⁻¹ b of every run
+        # V⁻¹ b of all runs.
         columns = self.pull[:, :, None]
         inverse_pull = np.linalg.solve(self.inner, columns)[:, :, 0]
 
-        # (4), its right side
+        # Right-hand side of (4).
         right = self.gradient - np.einsum("rqs,rs->q", self.cross, inverse_pull)
 
         shared = np.zeros(len(right))
         moves = ~stuck
         if moves.any():
             free = schur[np.ix_(moves, moves)]
-            # Parameters on one scale: curvatures of an outlet of 1e-6 m^2 and of a lag of seconds
-            # differ by more than double precision holds, and the smaller would be taken for zero.
+            # Scale the parameters: curvatures of an outlet of 1e-6 m^2 and of a lag of seconds
+            # differ by more than double precision resolves, and the smaller one would be treated as
+            # zero.
             scale = np.sqrt(np.maximum(np.diagonal(self.shared)[moves], LEAST_POWER))
             scaled = free / np.outer(scale, scale)
             if not np.isfinite(scaled).all():
-                # Derivatives of a motion that explodes lead nowhere.
+                # Derivatives of an unstable motion give no usable step.
                 return np.full(len(right), np.nan), np.full(self.pull.shape, np.nan)
-            # least squares takes the shortest step where parameters act alike
+            # Least squares takes the shortest step if parameters have the same response.
             solution = np.linalg.lstsq(scaled, right[moves] / scale, rcond=None)
             shared[moves] = solution[0] / scale
 
@@ -101,15 +107,15 @@ class _Arrow:
 
 
 def schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, Array]:
-    """What the shared parameters keep when the initial states of every run are eliminated.
+    """Eliminate the initial states of every run from the normal equations.
 
     Args:
         shared: (q, q) U.
-        cross: (R, q, s) every W_i.
-        inner: (R, s, s) every V_i.
+        cross: (R, q, s) all W_i.
+        inner: (R, s, s) all V_i.
 
     Returns:
-        The matrix (q, q) of (4), and every V_i⁻¹ W_iᵀ (R, s, q).
+        The matrix (q, q) of (4), and all V_i⁻¹ W_iᵀ (R, s, q).
     """
     transposed = cross.transpose(0, 2, 1)
     solved = np.linalg.solve(inner, transposed)
@@ -120,10 +126,17 @@ def schur_complement(shared: Array, cross: Array, inner: Array) -> tuple[Array, 
 
 
 def held(inner: Array, cross: Array, known: Mask) -> tuple[Array, Array]:
-    """Every V_i (R, s, s) and W_i (R, q, s) with known initial states (R, s) held where they are:
-    no parameter leads to them, and neither does another state.
+    """Fix known initial states in the normal equations.
+
+    Args:
+        inner: (R, s, s) all V_i.
+        cross: (R, q, s) all W_i.
+        known: (R, s) mask of known initial states.
+
+    Returns:
+        V_i and W_i, in which no parameter and no other state is coupled to a known state.
     """
-    # a known state's equation reads: its step is zero
+    # The equation of a known state becomes: its step is zero.
     touched = known[:, :, None] | known[:, None, :]
     alone = np.where(touched, np.eye(inner.shape[1]), inner)
     return alone, np.where(known[:, None, :], 0.0, cross)
@@ -139,16 +152,16 @@ def arrow_step(
     damping: float,
     stuck: Mask,
 ) -> Step:
-    """One damped Gauss-Newton step.
+    """Compute one damped Gauss-Newton step.
 
     Args:
-        residual: (R, T, C) whitened, observed less simulated.
-        jacobian: (R, T, C, q + s) of what is simulated, whitened; initial states last.
+        residual: (R, T, C) whitened residual, observed minus simulated.
+        jacobian: (R, T, C, q + s) whitened derivatives of the simulation; initial states last.
         q: number of shared parameters.
-        drift: (R, s) the d of (1): how far initial states are from their guesses, in sigmas.
+        drift: (R, s) the d of (1): deviations of initial states from their guesses, in sigmas.
         prior: (s,) the π of (1).
         known: (R, s) initial states that do not move.
-        damping: the λ of Levenberg and Marquardt.
+        damping: Levenberg-Marquardt damping λ.
         stuck: (q,) parameters that do not move.
     """
     runs, size = len(residual), jacobian.shape[3]
@@ -166,9 +179,9 @@ def _normal(
     drift: Array,
     prior: Array,
 ) -> _Arrow:
-    """Equations (2) and (3) of residuals (R, n) and their derivatives (R, n, q + s)."""
+    """Build equations (2) and (3) from residuals (R, n) and derivatives (R, n, q + s)."""
     own = slice(q, j.shape[2])
-    # one product holds every AᵀA, AᵀB and BᵀB, another every Aᵀr and Bᵀr
+    # One product contains all AᵀA, AᵀB and BᵀB, another one all Aᵀr and Bᵀr.
     transposed = j.transpose(0, 2, 1)
     normal = np.matmul(transposed, j)
     residuals = r[:, :, None]
@@ -183,7 +196,7 @@ def _normal(
 
 
 def _damped(arrow: _Arrow, damping: float, known: Mask) -> _Arrow:
-    """The equations damped, and with initial states that do not move where they are known."""
+    """Return the damped equations, in which known initial states do not move."""
     diagonal = np.einsum("rii->ri", arrow.inner)
     inner = arrow.inner + damping * diagonal[:, :, None] * np.eye(arrow.inner.shape[1])
     inner, cross = held(inner, arrow.cross, known)
@@ -202,7 +215,7 @@ def _promised(
     shared: Array,
     own: Array,
 ) -> float:
-    """What a step would gain if the residual were linear, (6)."""
+    """Return the decrease (6) of the cost if the residual were linear."""
     repeated = np.tile(shared, (len(r), 1))
     steps = np.concatenate([repeated, own], axis=1)
     changes = np.matmul(j, steps[:, :, None])[:, :, 0]

@@ -1,6 +1,4 @@
-"""Fits the base model: parameters that the system has anyway, and initial states, from anywhere in
-the bounds.
-"""
+"""Multi-start fit of the base model: base parameters and initial states, within all bounds."""
 
 from __future__ import annotations
 
@@ -18,39 +16,53 @@ from bench.runs.standalone import evenly
 from sims.base import Array, Parameter
 
 STARTS = 15
-"""Starts over the bounds, beside the nominal one."""
+"""Number of starts over the bounds, in addition to the nominal start."""
 KEPT = 3
-"""So many of them are fitted: those nearest to the data."""
+"""Number of starts that are fitted: those with the lowest cost."""
 LAST_STEPS = 10
-"""Steps of the fit that follows when parameters have been found untouched."""
+"""Maximum number of steps of a final fit, after parameters or settings have changed."""
 TOUCHED = 1.0
-"""A parameter that changes the observations by less than this many sigmas in all, moved across its
-bounds, is not touched by the data."""
+"""Minimum change of the observations, in sigmas, of a parameter that influences the data.
+
+The change is that of all samples together (root of the sum of squares) when the parameter moves
+across its bounds.
+"""
 LOGARITHMIC = 5.0
-"""Bounds whose ratio is larger are searched by their logarithm."""
+"""Minimum ratio of the bounds of a parameter for which starts are spaced logarithmically."""
 LOST = 1e3
-"""Residual, in the channel's unit, that a sample counts which a start could not simulate."""
+"""Residual of a sample that a start could not simulate, in the unit of the channel."""
 
 
 class Horizon(NamedTuple):
-    """A first share of each run that is fitted, and how many steps of it."""
+    """A fit horizon.
+
+    Attributes:
+        share: initial share of each run that is fitted.
+        iterations: number of steps of the fit.
+    """
 
     share: float
     iterations: int
 
 
 FOLLOWED = (Horizon(1.0, 6),)
-"""The same of a robot whose runs a filter has followed: they begin near their best states."""
+"""Fit horizons of a robot whose runs start near their best states, due to a state filter."""
 HORIZONS = (Horizon(0.2, 6), Horizon(0.45, 6), Horizon(1.0, 20))
-"""Fitted one after another: the end of a run depends on its beginning in ways that only a nearly
-fitted model follows.
+"""Fit horizons, used one after another.
+
+The end of a run depends on its beginning so strongly that only a nearly fitted model can follow it.
 """
 
 
 @dataclass(frozen=True)
 class Base:
-    """The fitted base model: its fit, and which parameters stay nominal, since the data do not
-    touch them, or do not fix them beside the others.
+    """The fitted base model.
+
+    Attributes:
+        fit: the fit.
+        untouched: indices of parameters that stay nominal because they do not influence the data.
+        vague: indices of parameters that stay nominal because the data do not determine them
+            together with the others.
     """
 
     fit: Fit
@@ -59,22 +71,25 @@ class Base:
 
     @property
     def frozen(self) -> frozenset[int]:
-        """All parameters that stay nominal."""
+        """Indices of all parameters that stay nominal."""
         return self.untouched | self.vague
 
 
 def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
-    """Fit parameters and initial states.
+    """Fit base parameters and initial states.
 
     Args:
         world: the runs.
-        noise: weighs the channels.
-        given: (b,) base parameters to start from, those of a tuner; else a grid of starts over the
-            bounds.
+        noise: noise that weights the channels.
+        given: (b,) base parameters to start from, for example from a tuner; None for a multi-start
+            over the bounds.
+
+    Returns:
+        The best fit, with insensitive parameters at their nominal values.
     """
     thetas = _starts(world, given)
     starts = [Start((), theta, world.guess) for theta in thetas]
-    # to simulate a start costs far less than to fit it, so the field is thinned first
+    # Simulating a start costs far less than fitting it, so the starts are reduced first.
     world.watch.tell(f"base fit from {len(starts)} starts")
     if len(starts) > KEPT:
         order = np.argsort(costs_of_starts(world, noise, starts), kind="stable")
@@ -87,14 +102,15 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
         starts = [fit.start() for fit in fits]
     best = min(fits, key=lambda fit: fit.cost)
     if world.linear and world.followed is None:
-        # what was taken about the first start is taken about the fitted model, for all that follow
-        # loaded where there is a robot alone
+        # Derivatives about the first start are replaced by those about the fitted model for all
+        # later fits. The import is local, because only robots need it.
         from bench.gap.model.tangents import begun
 
         begun(world, best.theta, best.states, anew=True)
         best = Fitter(world, noise).fit([best.start()], LAST_STEPS)[0]
 
-    # what the data do not touch stands wherever the search left it: nominal says more
+    # An insensitive parameter is set to nominal, because the value that the search reached means
+    # nothing.
     places = world.base.tolist()
     untouched = frozenset(i for i in places if not _touched(world, best, i, noise))
     if untouched:
@@ -107,8 +123,14 @@ def fit_base(world: World, noise: Noise, given: Array | None = None) -> Base:
 
 
 def without_step(world: World, noise: Noise, base: Base) -> Base:
-    """The base model of a robot, without what the engine's own step leaves of it."""
-    # loaded where there is a robot alone
+    """Return the base model of a robot, corrected for the discretisation error and fitted again.
+
+    Args:
+        world: the runs of a robot; the correction is stored in it.
+        noise: noise of each channel.
+        base: the fitted base model.
+    """
+    # Imported here, because only robots need it.
     from bench.gap.model.tangents import correct
 
     correct(world, noise, base.fit.theta, base.fit.states)
@@ -119,14 +141,14 @@ def without_step(world: World, noise: Noise, base: Base) -> Base:
 
 
 def _starts(world: World, given: Array | None) -> list[Array]:
-    """Parameter vectors (P,) to begin with: the given one, or the nominal one and a grid."""
+    """Return start parameters (P,): the given ones, or the nominal ones and a regular grid."""
     nominal = world.nominal()
     if given is not None:
         nominal[world.base] = given
         return [nominal]
     parameters = [world.parameters[i] for i in world.base]
     starts = [nominal]
-    # a simulator may have nothing to tune: its base fit is that of initial states
+    # A simulator may have no parameters; its base fit only fits initial states.
     if not parameters:
         return starts
     for shares in evenly(STARTS, len(parameters)):
@@ -138,7 +160,7 @@ def _starts(world: World, given: Array | None) -> list[Array]:
 
 
 def _between(parameter: Parameter, share: float) -> float:
-    """The value at a share of a parameter's bounds."""
+    """Return the value at a share of the bounds of a parameter."""
     low, high = parameter.bounds
     if low > 0 and high / low > LOGARITHMIC:
         return float(low * (high / low) ** share)
@@ -146,8 +168,15 @@ def _between(parameter: Parameter, share: float) -> float:
 
 
 def misfit_of_starts(world: World, noise: Noise, share: float) -> float:
-    """The lowest sum of squares of the starts of a base fit before they are fitted, over the first
-    share of each run; infinite where none of them can be simulated.
+    """Return the lowest cost of the starts of a base fit, before any fit.
+
+    Args:
+        world: the runs.
+        noise: noise that weights the channels.
+        share: initial share of each run that counts.
+
+    Returns:
+        The sum of squares; infinite if no start can be simulated.
     """
     starts = [Start((), theta, world.guess) for theta in _starts(world, None)]
     return float(costs_of_starts(world, noise, starts, share, np.inf).min())
@@ -160,13 +189,13 @@ def costs_of_starts(
     share: float = HORIZONS[0].share,
     lost: float = LOST,
 ) -> Array:
-    """Return the sums of squares of each start over the first samples of the runs.
+    """Return the sum of squares of each start over the first samples of the runs.
 
     Args:
         world: the runs.
-        noise: weighs the channels.
+        noise: noise that weights the channels.
         starts: parameters and initial states.
-        share: only this first share of each run counts.
+        share: initial share of each run that counts.
         lost: residual of a sample that could not be simulated.
     """
     count, runs = len(starts), len(world.tracks)
@@ -177,7 +206,7 @@ def costs_of_starts(
     simulated = world.simulate(theta, lanes, states, share)
     simulated = simulated.reshape(count, runs, *simulated.shape[1:])
 
-    # a start that was given up has no samples: it must not seem to fit them
+    # An abandoned start has no samples, and must not seem to fit them.
     left = np.nan_to_num(world.observed - simulated, nan=lost)
     residuals = np.where(world.counted(share), left, 0.0) / noise.sigma
     costs: Array = np.square(residuals).sum(axis=(1, 2, 3))
@@ -185,14 +214,14 @@ def costs_of_starts(
 
 
 def _touched(world: World, fit: Fit, place: int, noise: Noise) -> bool:
-    """Whether the data tell anything of a parameter."""
-    # one that was frozen has no column
+    """Return whether a parameter influences the data."""
+    # A fixed parameter has no column.
     columns = np.flatnonzero(fit.free == place)
     if not columns.size:
         return False
     low, high = world.parameters[place].bounds
     change = fit.jacobian[..., columns[0]] * (high - low) / noise.sigma
-    # only where a sample could show it
+    # Count only available samples.
     shown = change[np.isfinite(world.observed)]
     sigmas = np.sqrt(np.square(shown).sum())
     return float(sigmas) > TOUCHED

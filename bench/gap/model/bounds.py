@@ -1,4 +1,4 @@
-"""The range of each coefficient of an effect: where one expects it, and where a fit may move it.
+"""Ranges of effect coefficients: where they are plausible, and where a fit may move them.
 
 Times and frequencies follow the time scale of the recording (`bench.gap.model.time_scale`).
 """
@@ -15,39 +15,53 @@ from sims.base import Array, Parameter
 from sims.system import Coefficient, Effect, Friction
 
 BEYOND = 20.0
-"""A coefficient of a system in equations may be this many times as large as its plausible range."""
+"""Ratio of the fit bounds to the plausible range, for coefficients of equation-based systems."""
 BEYOND_MODEL = 1000.0
-"""The same of a number that a robot's model file states. Its total has physical limits (`least` and
-`most` of the coefficient), and its plausible range is a guess from the robot's weight: damping of
-60 N m s on a link of 1 N m is unusual, and possible.
+"""Ratio of the fit bounds to the plausible range, for quantities that a robot model file specifies.
+
+The total of such a quantity has physical limits (`least` and `most` of the coefficient), and its
+plausible range is a guess from the weight of the robot: damping of 60 N m s on a link of 1 N m is
+unusual, but possible.
 """
 DRY = 4.0
-"""The same for dry friction: what is stronger only sticks, and sticking divides the engine's steps.
+"""Ratio of the fit bounds to the plausible range, for dry friction.
+
+Stronger friction only sticks, and sticking divides the steps of the engine.
 """
 PER_FORCE = ("1/N", "1/(N")
-"""Units of what grows faster than a force."""
+"""Units of coefficients of terms that grow faster than linearly with a force."""
 CYCLES = 1.0
-"""What comes and goes must do so about once in the longest run, else any slow change would be
-called periodic.
+"""Minimum number of cycles of a periodic effect within the longest run.
+
+With fewer cycles, any slow change would be called periodic.
 """
 AT_BOUND = 1e-6
-"""A fitted number is at a bound if it is nearer to it than this share of its range. A bound of zero
-is met exactly or not at all, since ranges are wide against small coefficients.
+"""Maximum distance of a value at a bound from this bound, as a share of the range.
+
+A bound of zero is reached exactly or not at all, because ranges are wide compared with small
+coefficients.
 """
 NEAR = 1e-3
-"""It is also nearer to the bound than this share of the bound itself."""
+"""Maximum distance of a value at a bound from this bound, as a share of the bound itself.
+
+It applies in addition to `AT_BOUND`.
+"""
 
 Bound = Literal["low", "high"]
-"""Which end of its range a number lies at."""
+"""End of a range that a value lies at."""
 
 
 def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
-    """The range in which a fit may move each coefficient of an effect.
+    """Return the range in which a fit may move each coefficient of an effect.
 
-    A plausible range orders causes and is reported where a value exceeds it; it does not overrule
-    the data. A fit ends at what is physically possible (`Coefficient.least` and `most`: no total of
-    friction, damping, inertia or mass is negative), or far beyond the plausible range. What is zero
-    or positive by its meaning stays so, and what shapes an effect stays in its range.
+    A plausible range ranks causes, and values outside it are reported, but it does not override the
+    data. A fit is limited by physics (`Coefficient.least` and `most`: totals of friction, damping,
+    inertia and mass are not negative), or far outside the plausible range. A coefficient that is
+    nonnegative by definition stays so, and a shape parameter stays in its range.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
     """
     effect = world.effects[name]
     pairs = zip(world.parameters[world.slots[name]], effect.coefficients, strict=False)
@@ -58,28 +72,46 @@ def coefficient_bounds(world: World, name: str) -> list[tuple[float, float]]:
 
 
 def clip_coefficients(world: World, name: str, c: Array) -> Array:
-    """Limit the coefficients (k,) of an effect to the range in which a fit may move them."""
+    """Clip the coefficients (k,) of an effect to the range in which a fit may move them.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        c: (k,) its coefficients.
+    """
     limited: Array = np.clip(c, *np.array(coefficient_bounds(world, name)).T)
     return limited
 
 
 def is_unusual(value: float, low: float, high: float) -> bool:
-    """Whether a fitted number lies outside its plausible range, by more than rounding."""
+    """Return whether a value lies outside its plausible range by more than rounding.
+
+    Args:
+        value: the value.
+        low: lower end of the range.
+        high: upper end of the range.
+    """
     near = AT_BOUND * (high - low)
     return not low - near <= value <= high + near
 
 
 def bound_of(value: float, low: float, high: float) -> Bound | None:
-    """Which end of its range a fitted number lies at; None if it lies inside."""
+    """Return the end of its range that a value lies at; None if it lies inside.
+
+    Args:
+        value: the value.
+        low: lower end of the range.
+        high: upper end of the range.
+    """
     near = AT_BOUND * (high - low)
-    # A range may be a thousand times as wide as a bound is far from zero.
+    # A range may be a thousand times as wide as the distance of its bound from zero.
     if value <= low + min(near, NEAR * abs(low)):
         return "low"
     return "high" if value >= high - min(near, NEAR * abs(high)) else None
 
 
 def _within(bounds: tuple[float, float], coefficient: Coefficient) -> tuple[float, float]:
-    """A range cut to what is physically possible."""
+    """Return a range restricted to the physical limits of a coefficient."""
     low, high = bounds
     if coefficient.least is not None:
         low = max(low, coefficient.least)
@@ -91,25 +123,25 @@ def _within(bounds: tuple[float, float], coefficient: Coefficient) -> tuple[floa
 def _bounds(
     parameter: Parameter, coefficient: Coefficient, effect: Effect, world: World
 ) -> tuple[float, float]:
-    """The range of one coefficient without its physical limits."""
+    """Return the range of one coefficient without its physical limits."""
     low, high = parameter.bounds
     longest = world.longest
     if is_instant(parameter):
         return world.clock
     if parameter.unit == "Hz":
-        # no higher than half of the range, so that there is one left
+        # The lower bound is at most half of the upper bound, so that the range is not empty.
         low = min(max(low, CYCLES / longest), high / 2.0)
-    # a shape: how often, how fast, how sharp
+    # A positive lower bound marks a shape parameter, such as a frequency, a rate or a sharpness.
     if low > 0:
         return low, high
     if parameter.unit == "s":
-        # what takes longer than a run is a constant in it
+        # Delays longer than a run look constant within it.
         return max(BEYOND * low, -longest), min(BEYOND * high, longest)
-    # a part that grows with the square of a force sticks nowhere by itself
+    # A term that grows with the square of a force does not cause sticking by itself.
     dry = isinstance(effect, Friction) and not parameter.unit.startswith(PER_FORCE)
     beyond = DRY if dry else BEYOND
-    # of a robot these limits are of what its file states
+    # The limits of a robot coefficient refer to the total with the value of the model file.
     if world.kind.has_model and coefficient.least is not None:
         beyond = BEYOND_MODEL
-    # a size whose sign is part of what the effect is has a low end of zero
+    # A coefficient whose sign is part of the definition of its effect has a lower bound of zero.
     return beyond * low, beyond * high

@@ -1,10 +1,11 @@
-"""Independent pieces of work on all cores, in processes that inherit what they work on.
+"""Pool of forked worker processes that share the independent tasks of one search.
 
-A piece is the same whoever does it: what is cut into pieces, and how, never depends on the number
-of workers, so that the answer is the same to the last bit with one and with many. Workers are
-forked when there has been enough to do that they pay. They know the world as it was then, get small
-messages, and end with the crew, with their parent (by a signal of the kernel's, and by the end of
-their pipe), and not by Ctrl-C, which is the parent's to answer.
+The result of a task does not depend on the process that runs it. The split into tasks does not
+depend on the number of workers either, so the results are bit-identical with one worker and with
+many. Workers are forked only after enough work has been done to justify their cost. They inherit
+the `World` objects as they were then and receive small messages. They end with the pool, or with
+their parent (by a kernel signal and by the end of their pipe). They ignore Ctrl-C, which only the
+parent handles.
 """
 
 from __future__ import annotations
@@ -36,17 +37,17 @@ if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
 
 PAYS = 0.4
-"""Seconds of work that could have been shared after which workers are started."""
+"""Seconds of work in parallelisable tasks after which workers are started."""
 LOOK = 0.05
-"""Seconds between two looks at whether the search has to end."""
+"""Interval in seconds at which the pool checks whether the search must end."""
 
 Result = TypeVar("Result")
 Task = Callable[..., Result]
-"""A function of a module: the world comes first, then what a message brings."""
+"""A module-level function: its first argument is the world, the others come from the message."""
 
 
 class Place(Protocol):
-    """What is worked on: a world."""
+    """Shared state that tasks work on, such as a `World`."""
 
     simulations: int
     watch: Watch
@@ -59,9 +60,7 @@ class _Worker(NamedTuple):
 
 
 class _Answer(NamedTuple):
-    """What a worker sends back: a result or what went wrong and where, and what it takes to account
-    for.
-    """
+    """Reply of a worker: a result or an error with its traceback, and counts for the parent."""
 
     result: Any
     error: Exception | None
@@ -71,23 +70,23 @@ class _Answer(NamedTuple):
 
 
 class _ThereError(Exception):
-    """Where in a worker an error was raised, as its cause."""
+    """Traceback of an error inside a worker, attached as the cause of the error."""
 
     def __str__(self) -> str:
         return f"in a worker:\n{self.args[0]}"
 
 
 class Crew:
-    """Works with up to so many processes.
+    """Pool of up to a given number of worker processes.
 
     Args:
-        jobs: how many; 1 is this process alone.
+        jobs: maximum number of processes; 1 means only this process.
     """
 
     def __init__(self, jobs: int = 1) -> None:
         self._jobs = jobs
         self._spent = 0.0
-        # Worlds that are not done with; and those that the workers know, by their numbers there.
+        # `_worlds` are all registered worlds, `_known` those that the present workers inherited.
         self._worlds: list[Place] = []
         self._known: list[Place] = []
         self._team: list[_Worker] = []
@@ -96,19 +95,31 @@ class Crew:
     def map(
         self, world: Place, task: Task[Result], items: Sequence[tuple[Any, ...]]
     ) -> list[Result]:
-        """What a task makes of each item, in their order; arguments as those of `each`."""
+        """Run a task on each item, and return the results in the order of the items.
+
+        Args:
+            world: first argument of the task.
+            task: a module-level function.
+            items: further arguments of each call.
+
+        Returns:
+            One result per item.
+        """
         results = dict(self.each(world, task, items))
         return [results[number] for number in range(len(items))]
 
     def each(
         self, world: Place, task: Task[Result], items: Sequence[tuple[Any, ...]]
     ) -> Iterator[tuple[int, Result]]:
-        """What a task makes of each item, by the item's number, in the order in which they come.
+        """Run a task on each item, and yield item numbers and results as they arrive.
 
         Args:
-            world: the task's first argument; workers know it as it was when they were started.
-            task: a function of a module.
-            items: its further arguments.
+            world: first argument of the task; workers have it as it was when they were started.
+            task: a module-level function.
+            items: further arguments of each call.
+
+        Yields:
+            The number of an item and its result.
         """
         several = self._jobs > 1 and len(items) > 1
         if several and self._spent >= PAYS:
@@ -124,15 +135,15 @@ class Crew:
             yield number, result
 
     def join(self, world: Place) -> None:
-        """Know of a world that there will be work on, so that workers know it from their start."""
+        """Register a world for later work, so that workers inherit it when they start."""
         self._worlds.append(world)
 
     def forget(self, world: Place) -> None:
-        """Start new workers before the next work on a world, since it has changed."""
+        """Start new workers before the next work on a world, because it has changed."""
         self._known = [known for known in self._known if known is not world]
 
     def close(self) -> None:
-        """End all workers, whatever they are at, and do without."""
+        """Kill all workers, and continue without them."""
         for worker in list(self._team):
             worker.process.kill()
         for worker in list(self._team):
@@ -140,7 +151,7 @@ class Crew:
         self._jobs = 1
 
     def _ready(self, world: Place) -> None:
-        """Have workers that know a world: those that do not are followed by others."""
+        """Ensure that the workers know a world; otherwise replace them by new workers."""
         if _among(self._known, world):
             return
         for worker in list(self._team):
@@ -148,7 +159,7 @@ class Crew:
         if not _among(self._worlds, world):
             self.join(world)
         self._known = list(self._worlds)
-        # Asked now, as threads come and go.
+        # Checked at this moment, because threads may start and end.
         if can_fork():
             self._start()
 
@@ -156,11 +167,13 @@ class Crew:
         if self._ending is None:
             self._ending = mmap.mmap(-1, 1)
         context = multiprocessing.get_context("fork")
-        # What there is stays shared memory: a worker that collects garbage would write to it.
+        # Frozen objects stay in shared memory pages: garbage collection in a worker does not write
+        # to them.
         gc.freeze()
         for _ in range(self._jobs):
             mine, theirs = context.Pipe()
-            # Ends of other pipes that a worker held would keep those workers alive.
+            # A worker that inherits ends of other pipes would keep the workers of these pipes
+            # alive.
             others = [mine, *(worker.pipe for worker in self._team)]
             told = (self._known, theirs, others, self._ending, os.getpid())
             process = context.Process(target=_work, args=told, daemon=True, name="explain")
@@ -189,7 +202,7 @@ class Crew:
                 else:
                     self._lose(pipe)
                     waiting.append(number)
-            # All are gone: what is left is done here.
+            # All workers are gone, so the remaining items are processed here.
             if not busy:
                 yield from ((number, task(world, *items[number])) for number in waiting)
                 break
@@ -197,7 +210,7 @@ class Crew:
                 number = busy.pop(pipe)
                 answer = _received(pipe)
                 if answer is None:
-                    # A worker that died, for want of memory perhaps: its work is done again.
+                    # The worker died, perhaps for lack of memory, so its item is processed again.
                     self._lose(pipe)
                     waiting.append(number)
                     continue
@@ -208,13 +221,13 @@ class Crew:
                     errors[number] = answer.error, answer.trace
                 else:
                     yield number, answer.result
-        # The first in order, whichever came first.
+        # Raise the error of the first item in order, whichever error arrived first.
         for number in sorted(errors):
             error, trace = errors[number]
             raise error from _ThereError(trace)
 
     def _heard(self, pipes: list[Connection], world: Place) -> list[Any]:
-        """Pipes on which something has come; workers are told meanwhile if the search must end."""
+        """Wait for replies and return their pipes; tell workers to stop if the search must end."""
         while True:
             ready = connection.wait(pipes, LOOK)
             if self._ending is not None and world.watch.over():
@@ -223,7 +236,7 @@ class Crew:
                 return ready
 
     def _lose(self, pipe: Connection) -> None:
-        """Do without a worker."""
+        """Kill a worker and remove it from the pool."""
         for worker in list(self._team):
             if worker.pipe is pipe:
                 self._team.remove(worker)
@@ -233,28 +246,30 @@ class Crew:
 
 
 def _among(worlds: Sequence[Place], world: Place) -> bool:
-    """Whether it is one of them, and not only like it."""
+    """Return whether a world is one of the given objects (by identity, not equality)."""
     return any(one is world for one in worlds)
 
 
 def cores() -> int:
-    """How many this process may use."""
-    # On some systems nobody can say which they are.
+    """Return the number of CPU cores that this process may use."""
+    # The CPU affinity is not available on all systems.
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def can_fork() -> bool:
-    """Whether workers can inherit what there is: on Linux, without other threads, whose locks would
-    stay locked for ever, and in a process that may have children.
+    """Return whether workers can be forked from this process.
+
+    This requires Linux, no other threads (their locks would stay locked in the child), and a
+    process that may have children.
     """
     alone = threading.active_count() == 1
     return sys.platform == "linux" and alone and not multiprocessing.current_process().daemon
 
 
 class _Pickler(pickle.Pickler):
-    """Keeps the order of arrays in memory: sums depend on it, to the last bit."""
+    """Pickler that keeps the memory order of arrays, because sums depend on it in the last bit."""
 
     def reducer_override(self, thing: Any) -> Any:
         if type(thing) is not np.ndarray or thing.ndim < 2 or thing.flags.c_contiguous:
@@ -264,12 +279,12 @@ class _Pickler(pickle.Pickler):
 
 
 def _turned(values: Array, order: Array) -> Array:
-    """An array with its axes in another order, as it was before it was sent."""
+    """Restore the order of axes that an array had before it was sent."""
     return values.transpose(order)
 
 
 def packed(message: Any) -> bytes:
-    """A message for a pipe."""
+    """Serialise a message for a pipe."""
     buffer = io.BytesIO()
     _Pickler(buffer, protocol=pickle.HIGHEST_PROTOCOL).dump(message)
     return buffer.getvalue()
@@ -284,7 +299,7 @@ def _sent(pipe: Connection, message: Any) -> bool:
 
 
 def _received(pipe: Connection) -> _Answer | None:
-    """What a worker says; None if it is gone."""
+    """Return the reply of a worker, or None if the worker is gone."""
     try:
         answer: _Answer = pickle.loads(pipe.recv_bytes())
     except (EOFError, OSError):
@@ -299,12 +314,12 @@ def _work(
     ending: mmap.mmap,
     parent: int,
 ) -> None:
-    """What a worker does until its pipe ends."""
-    # A terminal's Ctrl-C reaches every process of the group; the parent alone answers it.
+    """Process the requests of the parent until the pipe ends; main loop of a worker."""
+    # Ctrl-C of a terminal reaches every process of the group; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(OSError):
         prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    # It may have ended before the kernel was asked.
+    # The parent may have ended before the kernel signal was requested.
     if os.getppid() != parent:
         return
     for other in others:

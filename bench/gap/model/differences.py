@@ -1,4 +1,4 @@
-"""Finite differences: how far each unknown of a model is moved, now and in the next step."""
+"""Step sizes of finite differences for the unknowns of a model."""
 
 from __future__ import annotations
 
@@ -10,60 +10,71 @@ from bench.gap.model.world import Indices
 from sims.base import Array
 
 RESPONSE = 0.1
-"""Finite differences move a parameter until the observation changes by this share of its noise,
-RMS.
-"""
+"""Target RMS change of the observations by a finite-difference step, in units of the noise."""
 FIRST_STEP = 1e-4
-"""The first one, before the response is known, as a share of a parameter's bounds."""
+"""Initial finite-difference step of a parameter, as a share of its range."""
 FIRST_STATE_STEP = 1e-5
-"""The first one of an initial state, SI units."""
+"""Initial finite-difference step of an initial state, SI units."""
 LARGEST_STEP = 1e-2
-"""The largest one, as a share of a parameter's bounds; of an initial state, SI units."""
+"""Maximum finite-difference step: a share of the range of a parameter; SI units for a state."""
 SMALLEST_STEP = 1e-5
-"""The smallest one, as a share of the largest: below it rounding is in the quotient."""
+"""Minimum finite-difference step, as a share of the maximum; smaller steps suffer from rounding."""
 ENDLESS = 1e30
-"""A change beyond it is none: the motion explodes, and says nothing of one near the data. Its
-square is a number still.
+"""Maximum magnitude of a usable derivative; its square is still finite.
+
+Larger values come from an unstable motion, which says nothing about motions near the data.
 """
 
 
 def followed(changes: Array) -> Mask:
-    """Where a change is one that the simulator can follow; neither NaN nor infinite are."""
-    # two masks, where a modulus would be a copy of the largest arrays there are
+    """Return where a change is usable: neither NaN, infinite, nor larger than `ENDLESS`."""
+    # Two comparisons avoid the modulus, which would copy one of the largest arrays.
     near: Mask = (changes > -ENDLESS) & (changes < ENDLESS)
     return near
 
 
 def displaced(start: Start, free: Indices, steps: Array, unknown: Indices) -> tuple[Array, Array]:
-    """Parameters (1 + q + n, P) and initial states (1 + q + n, R, s): as they are, then each
-    unknown moved by its step, each of n initial states in all runs at once.
+    """Build the inputs of a finite-difference Jacobian.
+
+    The first entry is not displaced. Each further entry has one unknown displaced by its step; an
+    initial state is displaced in all runs at once.
+
+    Args:
+        start: point of the derivatives.
+        free: (q,) indices of the fitted parameters.
+        steps: (q + s,) displacements.
+        unknown: (n,) indices of the initial states to displace.
+
+    Returns:
+        Parameters (1 + q + n, P) and initial states (1 + q + n, R, s).
     """
     q, count = free.size, unknown.size
     theta = np.tile(start.theta, (1 + q + count, 1))
     states = np.tile(start.states, (1 + q + count, 1, 1))
     for j, place in enumerate(free):
         theta[1 + j, place] += steps[j]
-    # no run's initial state touches another run: one lane has the derivatives of all
+    # An initial state influences only its own run, so one batch element per run gives all
+    # derivatives.
     for j, place in enumerate(unknown):
         states[1 + q + j, :, place] += steps[q + place]
     return theta, states
 
 
 def difference_steps(jacobian: Array, noise: Noise, widths: Array) -> Array:
-    """(q + s,) steps of finite differences that move the runs by `RESPONSE` of the noise.
+    """Return steps (q + s,) that change the observations by `RESPONSE` of the noise.
 
     Args:
-        jacobian: (R, T, C, q + s) by an earlier difference.
-        noise: of each channel.
-        widths: (q,) the ranges of the parameters' bounds.
+        jacobian: (R, T, C, q + s) derivatives from earlier finite differences.
+        noise: noise of each channel.
+        widths: (q,) widths of the parameter ranges.
     """
     squares = np.square(jacobian / noise.sigma[:, None])
     responses = np.sqrt(np.mean(squares, axis=(0, 1, 2)))
     states = np.full(len(responses) - len(widths), LARGEST_STEP)
     largest = np.concatenate([LARGEST_STEP * widths, states])
-    # an unknown without any response is moved as far as may be
+    # An unknown without any response gets the maximum step.
     with np.errstate(divide="ignore"):
         wanted = RESPONSE / np.where(responses > 0, responses, 1e-300)
-    # below the least step rounding would be the difference, above the largest one curvature
+    # Below the minimum step rounding dominates, above the maximum step curvature.
     steps: Array = np.clip(wanted, SMALLEST_STEP * largest, largest)
     return steps

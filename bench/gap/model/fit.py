@@ -1,9 +1,8 @@
-"""Least squares on trajectories: parameters that all runs share, initial states that each run has
-for itself.
+"""Least-squares fit of trajectories with shared parameters and initial states of each run.
 
-Levenberg-Marquardt for many models at once, so that one call of the engine serves all of them. One
-step of one model is in `arrow`. Noise that remembers is whitened first (`noise`), which makes the
-fit one of generalised least squares.
+Levenberg-Marquardt for many models at once, so that one engine call serves all of them. A single
+step of one model is in `arrow`. AR(1) noise is whitened first (`noise`), so the fit is a
+generalised least-squares fit.
 """
 
 from __future__ import annotations
@@ -30,30 +29,33 @@ from bench.gap.model.world import FEWEST_LANES, Indices, World
 from sims.base import Array
 
 UNMEASURED = 3.0
-"""1 sigma of what is known beforehand of an initial state that no sample shows, SI units."""
+"""Prior standard deviation of an initial state that no sample shows, SI units."""
 MEASURED = 100.0
-"""The same where samples show it, SI units: so wide that they decide alone."""
+"""Prior standard deviation of an initial state that samples show, SI units.
+
+It is so wide that the samples alone decide.
+"""
 
 GROUP = 60_000
-"""What a group of models costs in a step, about, in samples that are simulated."""
+"""Approximate cost of one step of a group of models, in simulated samples."""
 ALGEBRA = 8_000
-"""What the equations of one model cost in the same unit."""
+"""Cost of solving the equations of one model, in simulated samples."""
 
 _Trial = tuple[Problem, Start]
-"""A model, and where it may go next."""
+"""A model, and the point that its next step proposes."""
 
 
 @dataclass(frozen=True)
 class Fitter:
-    """Fits models to the runs of a world.
+    """Fits models to the runs of a `World`.
 
     Attributes:
         world: the runs.
-        noise: of each channel.
-        frozen: parameters that are not fitted, as the data do not show them.
-        share: only this first share of each run counts.
-        parameters: False to fit initial states alone.
-        exact: whether fits go on until nothing is left to gain, as where their numbers are told.
+        noise: noise of each channel.
+        frozen: indices of parameters that are not fitted, because the data do not show them.
+        share: only this initial share of each run counts.
+        parameters: False to fit only initial states.
+        exact: whether fits are refined to final convergence, as needed for reported parameters.
     """
 
     world: World
@@ -74,15 +76,18 @@ class Fitter:
         """Fit each model from its start.
 
         Args:
-            starts: where to begin; one or more.
-            iterations: steps of each, at most.
-            race: leave those unfinished that are far behind the best, or behind the cost reached.
-            reached: what other models have come down to.
+            starts: starts of the fits; one or more.
+            iterations: maximum number of steps of each fit.
+            race: whether to stop fits that are far behind the best fit or behind `reached`.
+            reached: lowest cost of other models.
             finished: called once for each model whose fit has ended.
+
+        Returns:
+            The fits in the order of their starts.
         """
         problems = [self._problem(start) for start in starts]
         for leg in legs(iterations, race):
-            # who is not done goes on, in groups that know nothing of each other within a leg
+            # Unfinished fits continue in groups, which exchange nothing within a round.
             going = [i for i, problem in enumerate(problems) if not problem.done]
             if not going or (leg.first and self.world.watch.leaves(leg.first / iterations)):
                 break
@@ -97,12 +102,14 @@ class Fitter:
         return [p.fit() for p in problems]
 
     def _terms(self) -> tuple[Any, ...]:
-        """All but the world."""
+        """Return all fields except the world, as sent to workers."""
         return self.noise, self.frozen, self.share, self.parameters, self.exact
 
     def _groups(self, problems: Sequence[Problem], going: Sequence[int]) -> list[list[int]]:
-        """Those that go on, in groups of about `GROUP` samples to simulate, of one kind each as far
-        as may be; one group where more lanes of a call cost less.
+        """Split unfinished fits into groups of about `GROUP` simulated samples.
+
+        Each group has models of one kind as far as possible. There is only one group if large
+        engine calls cost less per batch element.
         """
         world = self.world
         if not world.apart:
@@ -111,7 +118,7 @@ class Fitter:
         unknown = self._moved_states().size
         lanes = sum(1 + problems[i].free.size + unknown for i in going) * runs
         cost = lanes * length * self.share + ALGEBRA * len(going)
-        # compiled lanes are stepped side by side, however long they are
+        # Compiled batch elements are stepped in parallel, however long they are.
         count = int(np.ceil(min(cost / GROUP, lanes / FEWEST_LANES)))
         kinds = world.kinds(np.stack([problems[i].point.start.theta for i in going]))
         order = [going[i] for i in np.argsort(kinds, kind="stable")]
@@ -121,27 +128,30 @@ class Fitter:
     def go(
         self, problems: Sequence[Problem], leg: Leg, race: bool, reached: float
     ) -> list[Problem]:
-        """Some problems after a leg of their way.
+        """Advance fits by one racing round.
 
         Args:
-            problems: where they stand.
-            leg: which steps to make.
-            race: as in `fit`.
-            reached: likewise, those of other groups among them.
+            problems: states of the fits.
+            leg: the steps to make.
+            race: whether to stop fits that are far behind the best fit or behind `reached`.
+            reached: lowest cost of other models, including those of other groups.
+
+        Returns:
+            The fits after the round.
         """
-        # the samples that count, (R, T, C)
+        # Mask of the samples that count, (R, T, C).
         seen = self.world.counted(self.share)
         if not leg.first:
             self._begin(problems, seen)
         for iteration in range(leg.first, leg.last):
-            # in its first steps even the right model may be far behind
+            # In the first steps even the correct model may be far behind.
             if race and iteration >= RACED:
                 give_up(problems, reached)
             self._renew(problems, seen, waiting=not race or iteration >= RACED)
             trials = list(self._trials(problems, seen))
             if not trials and any(p.waits and not p.done for p in problems):
                 continue
-            # what comes after it sees that this was left off
+            # The caller checks whether the fit was stopped early here.
             if not trials or self.world.watch.leaves(iteration / leg.all):
                 break
             made = self._plain_points if self.world.linear else self._points
@@ -150,7 +160,7 @@ class Fitter:
         return list(problems)
 
     def _begin(self, problems: Sequence[Problem], seen: Mask) -> None:
-        """Where they begin, with derivatives; those that are known nearby do to begin with."""
+        """Simulate the starts, and compute derivatives or reuse known ones from nearby."""
         nearby = [p for p in problems if self._knows(p)]
         others = [p for p in problems if not self._knows(p)]
         if others:
@@ -167,13 +177,14 @@ class Fitter:
                 problem.here = False
 
     def _knows(self, problem: Problem) -> bool:
-        """Whether derivatives are known near a start, by all that is fitted."""
+        """Return whether derivatives by all fitted parameters are known near the start."""
         known = problem.point.start.known
         return self.world.linear and known is not None and np.array_equal(known.free, problem.free)
 
     def _renew(self, problems: Sequence[Problem], seen: Mask, waiting: bool) -> None:
-        """Take the derivatives anew of problems whose own are not good enough; of those that can
-        wait only where `waiting` says so.
+        """Recompute the derivatives of fits whose present ones are not good enough.
+
+        Fits that can wait are included only if `waiting` is true.
         """
         stale = [p for p in problems if p.stale and not p.done and (waiting or not p.waits)]
         if not stale:
@@ -181,7 +192,7 @@ class Fitter:
         for problem in stale:
             problem.renewals += 1
             if problem.needs_own_states:
-                # Loaded where there is a robot alone.
+                # Imported here, because only robots need it.
                 from bench.gap.model.tangents import begun_about
 
                 at = problem.point.start
@@ -191,7 +202,7 @@ class Fitter:
             self._take(problem, point)
 
     def _problem(self, start: Start) -> Problem:
-        """What of a model is fitted, and how far it may go."""
+        """Create the state of a fit: the fitted parameters, their bounds and step sizes."""
         world = self.world
         free: list[int] = []
         bounds: list[tuple[float, float]] = []
@@ -201,16 +212,16 @@ class Fitter:
             for name in start.effects:
                 free += world.places(name)
                 bounds += coefficient_bounds(world, name)
-        # two columns also where nothing is free
+        # The shape has two columns even if nothing is fitted.
         table = np.array(bounds, dtype=np.float64).reshape(-1, 2)
         low, high = table.T
 
-        # plausible ranges scale the differences; a fit may leave them by far
+        # Plausible ranges scale the finite differences; a fit may go far beyond them.
         plausible = [world.parameters[i].bounds for i in free]
         widths = np.array([b - a for a, b in plausible], dtype=np.float64)
         state_steps = np.full(len(world.states), FIRST_STATE_STEP)
 
-        # a start may be the size that a score asks for, or come from wider bounds
+        # A start may have a size from a score test, or come from wider bounds.
         theta = start.theta.copy()
         theta[free] = np.clip(theta[free], low, high)
         begun = Start(start.effects, theta, start.states.copy(), start.known)
@@ -227,10 +238,11 @@ class Fitter:
         )
 
     def _points(self, trials: Sequence[_Trial], seen: Mask) -> list[Point]:
-        """What each problem gives at a trial's place, its derivatives and its cost.
+        """Simulate trial points together with their derivatives and cost.
 
-        One call of the engine has every run of every model, with every unknown moved: it goes
-        through time once for all of them. An initial state that every run knows is no unknown.
+        One engine call contains every run of every model with every unknown displaced, so it
+        integrates over time only once. An initial state that is known in every run is not an
+        unknown.
         """
         runs, size = self.world.guess.shape
         unknown = self._moved_states()
@@ -239,7 +251,7 @@ class Fitter:
             displaced(start, problem.free, step, unknown)
             for (problem, start), step in zip(trials, steps, strict=True)
         ]
-        # lanes model by model, in each unknown by unknown, in each run by run
+        # Batch elements are ordered by model, then by unknown, then by run.
         thetas = np.concatenate([np.repeat(theta, runs, axis=0) for theta, _ in moved])
         states = np.concatenate([begin.reshape(-1, size) for _, begin in moved])
         lanes = np.tile(np.arange(runs), len(thetas) // runs)
@@ -249,7 +261,7 @@ class Fitter:
         points = []
         first = 0
         for (problem, start), step in zip(trials, steps, strict=True):
-            # as it is, and with each unknown moved
+            # The first element is not displaced; each other one has one unknown displaced.
             last = first + 1 + problem.free.size + unknown.size
             part = simulated[first:last]
             first = last
@@ -261,7 +273,7 @@ class Fitter:
         return points
 
     def _plain_points(self, trials: Sequence[_Trial], seen: Mask) -> list[Point]:
-        """The same with the derivatives of where each problem stands, which cost nothing."""
+        """Simulate trial points, and keep the derivatives of the present point of each fit."""
         runs = len(self.world.guess)
         simulated = self.world.simulate(
             np.concatenate([np.tile(start.theta, (runs, 1)) for _, start in trials]),
@@ -275,19 +287,21 @@ class Fitter:
         ]
 
     def _moved_states(self) -> Indices:
-        """(n,) the initial states that are moved to find their derivatives: none where they come
-        from elsewhere.
+        """Return the indices (n,) of initial states that finite differences displace.
+
+        There are none if the derivatives come from a linearisation.
         """
         if self.world.linear:
             return np.array([], dtype=np.intp)
         return np.flatnonzero(~self.world.known.all(axis=0))
 
     def _begun(self, problem: Problem, start: Start, samples: int) -> Array:
-        """(R, T, C, s) derivatives by initial states, of the problem or those that come with the
-        world; zero where a state is known.
+        """Return derivatives (R, T, C, s) by initial states, zero where a state is known.
+
+        They are those of the fit itself, if it has any, or those that all models share.
         """
         world = self.world
-        # loaded where there is a robot alone
+        # Imported here, because only robots need it.
         from bench.gap.model.tangents import begun
 
         shared = problem.by_states
@@ -298,18 +312,19 @@ class Fitter:
         return kept
 
     def _derivatives(self, part: Array, steps: Array, unknown: Indices) -> Array:
-        """(R, T, C, q + s) difference quotients; zero by an initial state where it is known, which
-        absorbs nothing.
+        """Compute finite-difference derivatives (R, T, C, q + s).
+
+        They are zero for known initial states, which therefore absorb nothing of the residual.
 
         Args:
-            part: (1 + q + n, R, T, C) as it is, and with each unknown moved.
-            steps: (q + s,) by what.
-            unknown: (n,) the initial states that are moved.
+            part: (1 + q + n, R, T, C) simulation without and with each unknown displaced.
+            steps: (q + s,) displacements.
+            unknown: (n,) indices of the initial states that are displaced.
         """
         known = self.world.known
         q = steps.size - known.shape[1]
         columns = np.concatenate([np.arange(q), q + unknown])
-        # a lane that was given up is NaN, and tells nothing of how its unknown acts
+        # An abandoned batch element is NaN, so the effect of its unknown is not known.
         with np.errstate(all="ignore"):
             quotients = np.moveaxis(part[1:] - part[0], 0, -1) / steps[columns]
         jacobian: Array = np.where(followed(quotients), quotients, 0.0)
@@ -321,29 +336,29 @@ class Fitter:
         return jacobian
 
     def _take(self, problem: Problem, point: Point) -> None:
-        """Go on from a point, with differences that suit what it responds to."""
+        """Move a fit to a point, and adapt its difference steps to the responses there."""
         problem.point = point
         problem.here, problem.stale, problem.waits = True, False, False
         problem.steps = difference_steps(point.jacobian, self.noise, problem.widths)
 
     def _residual(self, simulated: Array, seen: Mask) -> Array:
-        """(R, T, C) observed less simulated, zero where nothing counts."""
+        """Return observed minus simulated (R, T, C), zero where no sample counts."""
         residual: Array = np.where(seen, self.world.observed - simulated, 0.0)
         return residual
 
     def _drift(self, states: Array) -> Array:
-        """(R, s) how far initial states are from their guesses, in sigmas."""
+        """Return the deviations (R, s) of initial states from their guesses, in prior sigmas."""
         drift: Array = (states - self.world.guess) / prior_of(self.world)
         return drift
 
     def cost(self, fit: Fit) -> float:
-        """What a fit costs by this noise."""
+        """Return the cost of a fit for the noise of this fitter."""
         return self._cost(fit.simulated, fit.states, self.world.counted(self.share))
 
     def _cost(self, simulated: Array, states: Array, seen: Mask) -> float:
-        """The cost of eq. (1) of `arrow`; infinite where the simulator gave up."""
+        """Return the cost, eq. (1) of `arrow`; infinite if the simulation was abandoned."""
         residual = self._residual(simulated, seen)
-        # a lane that was given up is NaN, which compares with nothing
+        # An abandoned batch element is NaN, which cannot be compared.
         if not np.isfinite(residual).all():
             return np.inf
         w = whitened(residual, seen, self.noise)
@@ -351,7 +366,7 @@ class Fitter:
         return float((w * w).sum() + (drift * drift).sum())
 
     def _trials(self, problems: Sequence[Problem], seen: Mask) -> Iterator[_Trial]:
-        """Where each problem that is not done goes next; one whose step promises nothing is."""
+        """Yield the next trial of each unfinished fit; a fit without a useful step is finished."""
         for problem in problems:
             if problem.done or problem.waits:
                 continue
@@ -360,11 +375,12 @@ class Fitter:
                 yield problem, trial
 
     def _trial(self, problem: Problem, seen: Mask) -> Start | None:
-        """The next parameters and initial states to try; None, and done, if they promise
-        nothing.
+        """Return the next parameters and initial states to try.
+
+        If no decrease is predicted, mark the fit as finished or waiting, and return None.
         """
         at = problem.point
-        # there is no downhill from where nothing could be simulated
+        # There is no descent direction from a point that could not be simulated.
         if not np.isfinite(at.cost):
             problem.done = True
             return None
@@ -381,10 +397,10 @@ class Fitter:
             prior_of(self.world),
             self.world.known,
             problem.damping,
-            problem.stuck(residual, jacobian),  # clipped afterwards, they would spoil the rest
+            problem.stuck(residual, jacobian),  # clipping them afterwards would distort the step
         )
         problem.promised = step.promised
-        # converged, or no step is short enough; where numbers overflow none is known
+        # The fit has converged, no step is short enough, or numbers overflow.
         if (
             not np.isfinite(step.promised)
             or step.promised < problem.enough(at.cost)
@@ -393,14 +409,14 @@ class Fitter:
             problem.finish()
             return None
 
-        # a copy: where the trial is refused, the old point stands
+        # Copy the parameters, because the old point is still needed if the trial is rejected.
         theta = at.start.theta.copy()
         moved = theta[problem.free] + step.shared
         theta[problem.free] = np.clip(moved, problem.low, problem.high)
         return replace(at.start, theta=theta, states=at.start.states + step.own)
 
     def _judge(self, problem: Problem, point: Point) -> None:
-        """Take a trial's point if it is better, and learn from it how much to damp."""
+        """Accept a trial point if its cost is lower, and update the damping."""
         gained = problem.point.cost - point.cost
         own = problem.here
         if point.cost < problem.point.cost:
@@ -415,16 +431,16 @@ class Fitter:
 
 
 def _gone(world: World, terms: tuple[Any, ...], *call: Any) -> list[Problem]:
-    """A group after a leg, whoever goes it."""
+    """Advance one group of fits by one racing round; runs in this process or in a worker."""
     return Fitter(world, *terms).go(*call)
 
 
 def prior_of(world: World) -> Array:
-    """(s,) what is known of initial states beforehand, 1 sigma."""
+    """Return the prior standard deviations (s,) of the initial states."""
     if world.state_prior is not None:
         return world.state_prior
     system, shown = world.simulator.system, set(world.channels)
-    # a coordinate's samples show its rate, too; behind the rates an own system may have more
+    # Samples of a coordinate also show its rate; a user-defined system may have further states.
     pairs = dict(zip(system.rates, system.coordinates, strict=False))
     measured = [name in shown or pairs.get(name) in shown for name in world.states]
     return np.where(measured, MEASURED, UNMEASURED)

@@ -1,4 +1,4 @@
-"""The noise floor: the error that a perfect model would have, from the sensor's own noise."""
+"""Noise floor: the error that a perfect model would have, due to sensor noise."""
 
 from __future__ import annotations
 
@@ -13,49 +13,67 @@ from sims.base import Array
 from sims.recording.recording import Recording
 
 PRECISION = 1e-4
-"""Share of a channel's range below which a difference is not the world's but the integrator's."""
+"""Minimum noise floor as a share of the range of a channel.
+
+Smaller differences are errors of the integrator.
+"""
 INNER = (0.02, 0.98)
-"""The range of a channel is that between these quantiles, so that an outlier does not widen it."""
+"""Quantiles between which the range of a channel is measured, so that outliers do not widen it."""
 TYPICAL = 1e-3
-"""Share of a channel's typical size that stands for a floor which no sample tells of."""
+"""Noise floor as a share of the typical size of a channel, if the samples give no estimate."""
 LEAST = 1e-12
-"""The lowest floor, SI units: residuals are divided by it."""
+"""Minimum noise floor in SI units, because residuals are divided by it."""
 MEDIAN = 1.2
-"""1 sigma of a sigma that a median of n independent magnitudes gives, as a share of it and times
-√n. It is 0.71 for the standard deviation, which is efficient; the median has 37 % of that.
+"""Relative standard error of a noise estimate, times √n for n samples.
+
+The estimate is the median of n independent magnitudes. For the standard deviation, which is
+efficient, the factor is 0.71; the median has an efficiency of 37 %.
 """
 FEW = 4
-"""Samples from which an estimate is taken to come at least."""
+"""Minimum number of samples assumed for the uncertainty of an estimate."""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """Noise of each channel, (C,) arrays: 1 sigma, whether it is stated, the step if quantised (0
-    if it is not).
+    """Noise floor of each channel.
+
+    Attributes:
+        sigma: (C,) standard deviation.
+        stated: (C,) whether it is specified by the recording, and not estimated.
+        step: (C,) quantisation step; 0 if the channel is not quantised.
+        uncertainty: (C,) relative standard error of the sigma.
     """
 
     sigma: Array
     stated: NDArray[np.bool_]
     step: Array
     uncertainty: Array
-    """1 sigma of an estimated sigma, as a share of it; 0 where it is stated."""
+    """Relative standard error (C,) of an estimated sigma; 0 if it is specified."""
 
 
 def noise_floor(world: World, recording: Recording) -> Floor:
-    """Stated, or estimated from all runs: those held out tell of the sensor, too."""
+    """Return the specified noise of each channel, or estimate it from all runs.
+
+    Held-out runs are included, because they also show the sensor noise.
+
+    Args:
+        world: the runs for fitting; its simulator defines the channels.
+        recording: the recording with all its runs.
+    """
     sigmas, stated, steps, doubts = [], [], [], []
     for channel in world.simulator.channels:
         signals = [(run.times, run.channels[channel.name]) for run in recording.runs]
         samples = [y[np.isfinite(y)] for _, y in signals]
         values = np.concatenate(samples)
-        # even where it is stated: a step tells that the channel is quantised
+        # Estimate also if the noise is specified, because the step shows whether the channel is
+        # quantised.
         estimate = estimated(signals)
         known = recording.noise.get(channel.name, 0.0) > 0
         sigma = recording.noise[channel.name] if known else estimate.sigma
 
-        # no simulation is as exact as an error of nothing asks for
+        # No simulation is accurate enough for a noise floor of zero.
         least = max(PRECISION * range_of(values), LEAST)
-        # too few samples, or none; of a channel that never changes no sample tells of its noise
+        # There may be too few samples; a channel that never changes does not show its noise.
         if not np.isfinite(sigma) or (not known and is_constant(values)):
             sigma = TYPICAL * channel.scale
         sigmas.append(max(sigma, least))
@@ -71,10 +89,10 @@ def noise_floor(world: World, recording: Recording) -> Floor:
 
 
 def is_constant(values: Array) -> bool:
-    """Whether there are samples (n,) and all are the same."""
+    """Return whether samples (n,) exist and are all equal."""
     return bool(values.size) and not np.ptp(values)
 
 
 def range_of(values: Array) -> float:
-    """The range of values (n,) but for outliers; 0 of none."""
+    """Return the range of values (n,) without outliers; 0 if there are no values."""
     return float(np.ptp(np.quantile(values, INNER))) if values.size else 0.0

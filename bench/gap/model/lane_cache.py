@@ -1,4 +1,4 @@
-"""Results of lanes that have been simulated, so that no lane is simulated twice."""
+"""Cache of simulated batch elements, so that none is simulated twice."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from collections.abc import Sequence
 from sims.base import Array
 
 CACHE_BYTES = 64 << 20
-"""Memory that the results of one world may take; the oldest are dropped beyond it."""
+"""Maximum memory for the cached results of one `World`, in bytes; the oldest are dropped first."""
 
 
 class LaneCache:
-    """Observations (T, C) of lanes by what determines them, within a limit of memory.
+    """Observations (T, C) of batch elements, cached by their inputs, with a memory limit.
 
-    A fit simulates a trial, accepts it, and then asks for it once more among the finite differences
-    about it; starts are compared before they are fitted. A third of a robot's lanes are such.
+    A fit simulates a trial, accepts it, and then needs it again as the centre of finite
+    differences; starts are compared before they are fitted. A third of the simulations of a robot
+    are such repetitions.
 
     Args:
-        limit: bytes of the results that are held.
+        limit: maximum size of the cached results, in bytes.
     """
 
     def __init__(self, limit: int = CACHE_BYTES) -> None:
@@ -26,26 +27,26 @@ class LaneCache:
         self._bytes = 0
 
     def missing(self, keys: Sequence[bytes]) -> list[int]:
-        """List the places of lanes whose result is not held; of equal ones the first alone."""
+        """Return the indices of elements that are not cached; of equal ones only the first."""
         first = {key: place for place, key in reversed(list(enumerate(keys)))}
         return sorted(place for key, place in first.items() if key not in self._held)
 
     def fill(
         self, keys: Sequence[bytes], places: Sequence[int], results: Array, out: Array
     ) -> None:
-        """Hold new results, and write those of all lanes.
+        """Store new results, and write the results of all elements to an output array.
 
         Args:
-            keys: of all lanes, as given to `missing`.
-            places: of the lanes that `missing` listed.
-            results: (N, T, C) theirs.
-            out: (L, T, C) where the results of all lanes are written.
+            keys: keys of all elements, as passed to `missing`.
+            places: indices of the elements that `missing` returned.
+            results: (N, T, C) results of these elements.
+            out: (L, T, C) output array for the results of all elements.
         """
         new = {keys[place]: row for place, row in zip(places, results, strict=True)}
         for place, key in enumerate(keys):
             out[place] = new[key] if key in new else self._held[key]
         for key, row in new.items():
-            # A copy: a view would keep the results of a whole call alive.
+            # Store a copy: a view would keep the results of a whole call in memory.
             self._held[key] = row.copy()
             self._bytes += row.nbytes
         while self._bytes > self._limit:

@@ -1,13 +1,14 @@
-"""The models of a recording: each a set of effects with its fit, its likelihood and its merit.
+"""Fitted models of a recording: effects, fit, likelihood and penalised log-likelihood.
 
-Of a model with log likelihood L that has k numbers fixed by n samples, the merit is
+For a model with log-likelihood L and k parameters determined by n samples, the penalised
+log-likelihood (merit) is
 
     M = 2 log L - k log n - Σ_e max(c_e - k_e log n, 0)                                          (1)
 
-Without the last term this is the criterion of G. Schwarz (Ann. Stat. 6(2), 461, 1978,
-doi:10.1214/aos/1176344136), turned over so that more is better. The last one is for effects e whose
-shapes are tried by the dozen: c_e is what the best of them gains by chance, and k_e log n what its
-coefficients have paid of that already.
+Without the last term, this is the criterion of G. Schwarz (Ann. Stat. 6(2), 461, 1978,
+doi:10.1214/aos/1176344136) with reversed sign, so that higher is better. The last term is for
+effects e with many candidate shapes: c_e is the gain of the best shape under the null hypothesis,
+of which the k_e coefficients already pay k_e log n.
 """
 
 from __future__ import annotations
@@ -28,30 +29,31 @@ from sims.base import Array
 Names = tuple[str, ...]
 
 SIFTED = (12, 8)
-"""Of models that are fitted with patience so many go on from each horizon to the next."""
+"""Numbers of models that continue after each fit horizon but the last, in patient fits."""
 STEPS = 24
-"""Steps of each fit, at most."""
+"""Maximum number of steps of each fit."""
 LEAST = 1e-3
-"""Share of a channel's noise that it is taken to have at least."""
+"""Minimum standard deviation of a channel in generalised fits, as a share of its noise."""
 ROUNDS = 4
-"""Fits of the model that is told, at most, each weighed by what the one before has left."""
+"""Maximum number of fits of the reported model, each weighted by the previous residual."""
 AGAIN = 3.0
-"""Merit gained by one of them with which another is worth its while."""
+"""Minimum gain in merit of such a fit for which another one is made."""
 MIMICRY = 1.2
-"""A fit that is weighed by what the one before has left may leave so many times the squares, as
-noise that remembers has it; one that leaves more was pulled away by what is no noise.
+"""Maximum growth factor of the sum of squares in a fit that assumes AR(1) noise.
+
+A fit that grows more was distorted by structure that is not noise.
 """
 LARGEST_DRAWN = 2**62
-"""Whole numbers below it tell streams of random numbers apart."""
+"""Upper limit of the integer that identifies the random number streams of a search."""
 _SIZES = {
     0: ("the base model", "the base model"),
     1: ("one effect", "single effects"),
     2: ("one pair of effects", "pairs of effects"),
     3: ("one set of three effects", "sets of three effects"),
 }
-"""One and several models with this number of effects, as the display of progress names them."""
+"""Singular and plural description of models by number of effects, for the progress display."""
 FEWEST = 2
-"""Samples that there are taken to be at least: the logarithm of one prices nothing."""
+"""Minimum number of samples assumed for the price of a parameter, because log 1 is zero."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +62,9 @@ class Model:
 
     Attributes:
         fit: the fit.
-        likelihood: of its residual.
-        merit: (1); the numbers that it counts are parameters, coefficients, and the initial states
-            that the data fix.
+        likelihood: likelihood of the residual of the fit.
+        merit: penalised log-likelihood (1); it counts parameters, coefficients, and the initial
+            states that the data determine.
     """
 
     fit: Fit
@@ -71,23 +73,24 @@ class Model:
 
     @property
     def names(self) -> Names:
-        """Its effects."""
+        """Names of the effects of the model."""
         return self.fit.effects
 
 
 @dataclass
 class Models:
-    """The models of one recording that have been fitted, by their effects.
+    """Fitted models of one recording, by their effects.
 
     Attributes:
         world: the runs for fitting.
-        noise: of the sensors.
-        frozen: parameters that the data do not touch.
-        rng: what all that is drawn follows from.
-        stated: (C,) whether the recording states the noise of each channel.
-        models: what was fitted.
-        chances: what each effect gains by chance about the base model.
-        derived: fits whose derivatives were taken again from both sides, each with what it was.
+        noise: sensor noise.
+        frozen: indices of parameters that do not influence the data.
+        rng: source of all random numbers.
+        stated: (C,) whether the recording specifies the noise of each channel.
+        models: the best fit for each set of effects.
+        chances: gain of each effect under the null hypothesis, about the base model.
+        derived: fits whose derivatives were recomputed with central differences, each with its
+            original fit.
     """
 
     world: World
@@ -104,29 +107,34 @@ class Models:
         self._drawn = int(self.rng.integers(LARGEST_DRAWN))
 
     def drawing(self, question: str, names: Iterable[str] = ()) -> np.random.Generator:
-        """The random numbers of a question about a model with these effects: the same whenever it
-        is asked, so that an answer does not hang on what was asked before.
+        """Return the random generator of a question about a model with the given effects.
+
+        It does not depend on earlier questions, so the answer does not either.
+
+        Args:
+            question: name of the question.
+            names: effects of the model.
         """
         return rng_for(self._drawn, question, *sorted(names))
 
     @property
     def seen(self) -> Mask:
-        """(R, T, C) samples that there are."""
+        """Mask (R, T, C) of available samples."""
         return np.isfinite(self.world.observed)
 
     def residual(self, fit: Fit) -> Array:
-        """(R, T, C) observed less simulated, zero where nothing was seen."""
+        """Return observed minus simulated (R, T, C), zero where no sample exists."""
         left = self.world.observed - fit.simulated
         residual: Array = np.where(self.seen, left, 0.0)
         return residual
 
     def enter(self, fit: Fit) -> Model:
-        """Take a fit into account; the better of two fits of the same effects is kept."""
+        """Store a fit, unless a better fit of the same effects is known; return the better one."""
         return self._entered(self._of(fit))
 
     def _entered(self, model: Model) -> Model:
-        """The better of a model and the one of the same effects that there is."""
-        # the order in which effects were added makes no difference
+        """Return the better one of a model and the stored model of the same effects."""
+        # The key does not depend on the order in which effects were added.
         key = frozenset(model.names)
         if key not in self.models or model.merit > self.models[key].merit:
             self.models[key] = model
@@ -134,9 +142,9 @@ class Models:
         return self.models[key]
 
     def _of(self, fit: Fit) -> Model:
-        """A fit with its likelihood and its merit."""
+        """Return a fit with its likelihood and merit."""
         free = fit.free.size + freedom(self.world, fit, self.noise)
-        # one that could not be simulated is entered, too: it need not be tried again
+        # A model that could not be simulated is stored, too, so that it is not tried again.
         found = _LOST
         if np.isfinite(fit.cost):
             found = likelihood(self.residual(fit), self.seen, free)
@@ -149,24 +157,26 @@ class Models:
         return start
 
     def force_of_any_shape(self, model: Model) -> tuple[float, str] | None:  # noqa: ARG002
-        """Return the p-value of the best force of any shape, and what it follows; None where that
-        is asked by simulation.
+        """Return the p-value of the best additional force and the signal that the force depends on.
+
+        Here always None: the test for unmodelled forces uses simulations.
         """
         return None
 
     def replaced(self, key: frozenset[str]) -> None:
-        """Called when a model has taken the place of another."""
+        """Called after a model has replaced another one; does nothing here."""
 
     @property
     def price(self) -> float:
-        """What each number that the data fix costs a model, the log n of (1)."""
+        """Penalty log n of (1) for each parameter that the data determine."""
         count = int(self.seen.sum())
         return float(np.log(max(count, FEWEST)))
 
     def chance_of(self, name: str) -> float:
-        """What an effect costs beside that, its part of the last term of (1)."""
+        """Return the additional penalty of an effect, its part of the last term of (1)."""
         slot = self.world.slots[name]
-        # few shapes gain less by chance than their coefficients pay
+        # If there are few shapes, the coefficients alone pay for the gain under the null
+        # hypothesis.
         paid = (slot.stop - slot.start) * self.price
         return float(max(self.chances.get(name, 0.0) - paid, 0.0))
 
@@ -177,14 +187,14 @@ class Models:
         patient: bool = False,
         race: bool = True,
     ) -> None:
-        """Fit models from their starts and enter them.
+        """Fit models from their starts and store them.
 
         Args:
-            starts: where to begin.
-            noise: weighs the samples; the search's own if None.
-            patient: fit the beginnings of the runs first, as the base model's fit does, and go on
-                with the best.
-            race: give up what falls far behind.
+            starts: starts of the fits.
+            noise: noise that weights the samples; None for `self.noise`.
+            patient: whether to fit the beginnings of the runs first, as in the base fit, and
+                continue with the best models.
+            race: whether to stop fits that fall far behind.
         """
         watch = self.world.watch
         watch.look(f"refit of {_listed(starts)}")
@@ -192,19 +202,19 @@ class Models:
         starts = [self.with_sensitivities(start) for start in starts]
         if patient:
             starts = self._sifted(starts, noise)
-        # sums of squares by other weights are not to be compared
+        # Sums of squares with different weights are not comparable.
         racing = race and noise is self.noise
         reached = self._reached(starts) if racing else np.inf
         fitter = Fitter(self.world, noise, self.frozen)
         watch.stage(_fitting(starts), len(starts))
         for fit in fitter.fit(starts, STEPS, race=race, reached=reached, finished=watch.advance):
             self.enter(fit)
-        # One that was left off is kept, and not judged.
+        # A fit that was stopped early is stored, but not evaluated.
         watch.check()
         self._report_best()
 
     def fit_all(self, starts: Sequence[Start]) -> list[Model]:
-        """Fit models from their starts side by side, and return the best fits of their effects."""
+        """Fit models from their starts together, and return the best fits of their effects."""
         self.refit(starts, race=False)
         return [self.models[frozenset(start.effects)] for start in starts]
 
@@ -213,7 +223,7 @@ class Models:
         return self.fit_all([start])[0]
 
     def _report_best(self) -> None:
-        """Report the model with the highest merit, and the share of the gap that it closes."""
+        """Report the model with the highest merit and the share of the discrepancy it removes."""
         base = self.models.get(frozenset())
         best = max(self.models.values(), key=lambda model: model.merit, default=base)
         if base is None or best is None or not best.names:
@@ -224,8 +234,9 @@ class Models:
             self.world.watch.found(best.names, max(share, 0.0))
 
     def exact(self, model: Model) -> Model:
-        """The model with derivatives of its own, where its fit has ended with those of a point
-        nearby; they are found once.
+        """Return the model with derivatives at its own parameters, computed at most once.
+
+        This is needed if the fit ended with derivatives from a nearby point.
         """
         if model.fit.own or not np.isfinite(model.fit.cost):
             return model
@@ -240,12 +251,12 @@ class Models:
         return result
 
     def to_the_end(self, model: Model) -> Model:
-        """The model fitted until nothing is left to gain, with what it leaves for its noise.
+        """Return the model fitted to final convergence, weighted by the noise of its own residual.
 
-        Where that remembers, generalised least squares is what intervals are for; and far from the
-        data its other weights lead on where the fit was caught, so that it is done again until they
-        change nothing. What it may not is leave clearly more: where structure is left it would
-        rather have that smooth than small.
+        With AR(1) noise, confidence intervals require generalised least squares. Far from the data,
+        the different weights also lead out of local minima, so the fit is repeated until it changes
+        nothing. A fit that leaves clearly larger residuals is rejected: with structured residuals,
+        this method prefers smooth residuals to small ones.
         """
         self.world.watch.stage("refining the model")
         squares = Fitter(self.world, self.noise).cost
@@ -253,7 +264,8 @@ class Models:
             left = model.likelihood
             if not np.isfinite(model.fit.cost):
                 break
-            # A channel without samples has no noise, and the weight of one without noise no end.
+            # A channel without samples has no noise, and a channel without noise would have
+            # infinite weight.
             sigma = np.where(np.isfinite(left.sigma), left.sigma, self.noise.sigma)
             noise = Noise(np.maximum(sigma, LEAST * self.noise.sigma), left.phi)
             fitter = Fitter(self.world, noise, self.frozen, exact=True)
@@ -266,16 +278,16 @@ class Models:
             gain = other.merit - model.merit
             if gain < AGAIN:
                 if gain > 0:
-                    # So near, what was scored about it holds as ever.
+                    # The fits are so close that scores about the old one remain valid.
                     model = self.models[frozenset(other.names)] = other
                 break
             model = self._entered(other)
         return model
 
     def _sifted(self, starts: Sequence[Start], noise: Noise) -> list[Start]:
-        """Where the best stand after all horizons but the last, which is the whole of the runs."""
+        """Return the starts of the best models after all fit horizons but the last (whole runs)."""
         begun = list(starts)
-        # patience takes every candidate along: only so many may cost a fit of the whole
+        # Patient fits keep all candidates at first, but only a few may be fitted to whole runs.
         for horizon, count in zip(HORIZONS[:-1], SIFTED, strict=True):
             fitter = Fitter(self.world, noise, self.frozen, horizon.share)
             fits = fitter.fit(begun, horizon.iterations)
@@ -284,75 +296,76 @@ class Models:
         return begun
 
     def _reached(self, starts: Sequence[Start]) -> float:
-        """The least sum of squares of the models known that have no more effects than the largest
-        of these.
-        """
+        """Return the lowest cost of known models with at most as many effects as the starts."""
         most = max(len(start.effects) for start in starts)
         known = self.models.values()
         costs = [m.fit.cost for m in known if 0 < len(m.names) <= most]
         return min(costs, default=np.inf)
 
     def best(self, size: int) -> Model | None:
-        """The best model with so many effects."""
+        """Return the model with the highest merit among those with `size` effects."""
         known = self.models.values()
         models = [m for m in known if len(m.names) == size]
         return max(models, key=lambda m: m.merit) if models else None
 
     def excess(self, model: Model) -> float:
-        """RMS of what a model leaves in units of the noise floor, less the one that noise itself
-        leaves.
-        """
+        """Return the RMS residual of a model in units of the noise floor, minus one."""
         scaled = self.residual(model.fit) / self.noise.sigma
         squares = np.square(scaled[self.seen])
         return float(np.sqrt(squares.mean())) - 1.0
 
     def weights(self, model: Model) -> Noise:
-        """Channels weigh by what the model leaves of them where that is more than their noise."""
+        """Return noise that is raised to the residual of a model where that is larger."""
         sigma = model.likelihood.sigma
-        # a channel without samples has no sigma, and its weight does not matter
+        # A channel without samples has no sigma, and its weight has no influence.
         left = np.where(np.isfinite(sigma), sigma, 0.0)
         return Noise(np.maximum(self.noise.sigma, left), self.noise.phi)
 
 
 def _listed(starts: Sequence[Start]) -> str:
-    """The models that begin there, in a few words."""
+    """Return a short description of the models that start there."""
     names = list(dict.fromkeys(" + ".join(start.effects) or "the base model" for start in starts))
     more = f" and {len(names) - 1} more" if len(names) > 1 else ""
     return f"{names[0]}{more}" if names else "nothing"
 
 
 def _fitting(starts: Sequence[Start]) -> str:
-    """Name the stage that fits these models, by their number of effects."""
+    """Return the name of the stage that fits these models, by their number of effects."""
     size = max((len(start.effects) for start in starts), default=0)
     one, several = _SIZES.get(size, (f"set of {size} effects", f"sets of {size} effects"))
     return f"fitting {one if len(starts) == 1 else several}"
 
 
 def freedom(world: World, fit: Fit, noise: Noise) -> float:
-    """How many initial states the data fix, all runs together: one that a model does not use gives
-    it no freedom.
+    """Return the number of initial states that the data determine, summed over all runs.
 
-    The effective degrees of freedom of ridge regression (T. Hastie, R. Tibshirani, J. Friedman, The
-    Elements of Statistical Learning, 2nd ed., section 3.4.1). With B_i the derivatives of run i by
-    its initial state in units of the noise, π its prior, and λ_ij the eigenvalues of π B_iᵀ B_i π,
+    These are the effective degrees of freedom of ridge regression (T. Hastie, R. Tibshirani, J.
+    Friedman, The Elements of Statistical Learning, 2nd ed., section 3.4.1); a state without
+    influence does not count. With the derivatives B_i of run i by its initial state in units of the
+    noise, the prior π, and the eigenvalues λ_ij of π B_iᵀ B_i π:
 
         f = Σ_ij λ_ij / (1 + λ_ij)                                                               (2)
+
+    Args:
+        world: the runs.
+        fit: the fitted model.
+        noise: noise of each channel.
     """
     seen = np.isfinite(world.observed)
     states = fit.jacobian[..., fit.free.size :]
     counted = np.where(seen[..., None], states, 0.0)
     scaled = counted / noise.sigma[:, None]
-    # written out, as -1 is ambiguous where there are no states
+    # The shape is written out, because -1 is ambiguous if there are no states.
     runs, length, channels, size = scaled.shape
     columns = scaled.reshape(runs, length * channels, size) * prior_of(world)
-    # a state that is known has no freedom
+    # A known state is not a degree of freedom.
     columns = np.where(world.known[:, None, :], 0.0, columns)
     normal = np.matmul(columns.transpose(0, 2, 1), columns)
     eigenvalues = np.linalg.eigvalsh(normal)
-    # rounding may put one a little below zero
+    # Rounding may make an eigenvalue slightly negative.
     fixed = eigenvalues / (1.0 + np.maximum(eigenvalues, 0.0))  # (2)
     return float(fixed.clip(0.0, 1.0).sum())
 
 
 _LOST = Likelihood(-np.inf, np.zeros(0), np.zeros(0))
-"""Of a model that could not be simulated."""
+"""Likelihood of a model that could not be simulated."""

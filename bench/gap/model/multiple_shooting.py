@@ -1,16 +1,16 @@
-"""Fits short pieces of the runs first, each from initial states of its own, to begin long runs near
-the right minimum.
+"""Multiple shooting: fit short segments of the runs first, to start long fits near the minimum.
 
-Over a long run a small change of a period, a limit or a delay moves the trajectory far from the
-data, so the sum of squares has many minima. Over pieces it has few, since every piece begins where
-the data are (multiple shooting; H. G. Bock 1983, doi:10.1007/978-1-4684-7324-7_7). With y the
-observation and h the simulated one at time t, from the state z_k that piece k has at τ_k, what is
-fitted is
+Over a long run, a small change of a period, a limit or a delay moves the trajectory far from the
+data, so the sum of squares has many local minima. It has few over short segments, because every
+segment starts at the data (multiple shooting; H. G. Bock 1983, doi:10.1007/978-1-4684-7324-7_7).
+With the observation y, the simulated observation h at time t, and the state z_k of segment k at its
+start time τ_k, the segments are fitted by
 
     min over θ, z_1 ... z_K of  Σ_k Σ_{τ_k ≤ t < τ_{k+1}} |y(t) - h(t; z_k, θ)|² / σ²            (1)
 
-Bock demands besides that piece k ends where piece k + 1 begins. Here nothing does: what the pieces
-find is where fits of the whole runs begin, which join them; it decides nothing.
+Bock also requires that segment k ends where segment k + 1 begins. This constraint is omitted here:
+the segment fit only gives a start for the fit of whole runs, which enforces continuity, and decides
+nothing itself.
 """
 
 from __future__ import annotations
@@ -26,24 +26,34 @@ from sims.base import Array
 from sims.recording.recording import Run
 
 PIECES = 4
-"""Of each run so many pieces, if each has enough samples; else fewer."""
+"""Maximum number of segments per run; a run gets fewer if the segments would be too short."""
 LEAST = 20
-"""Samples of a piece on average, at least."""
+"""Minimum number of samples per segment, on average over the segments of a run."""
 HOLES = 2
-"""A single piece may have this many times fewer, as samples may be missing."""
+"""Factor by which a single segment may have fewer samples than `LEAST`, due to missing samples."""
 LAST = 0.1
-"""Share of a run that is its end."""
+"""Share of a run, at its end, in which the influence of the initial state is measured."""
 FORGOTTEN = 0.1
-"""Share of what an initial state acts on a motion at most, below which it is forgotten."""
+"""Maximum influence of the initial state on the end of a run if the run forgets its initial state.
+
+The influence is a share of the largest influence within the run.
+"""
 
 
 def pieces(world: World) -> World | None:
-    """The world of the pieces, with the same parameters; None where every run is too short for two.
+    """Return a `World` of the segments with the same parameters.
 
-    None for what floats, since nothing says where it is when a piece begins. None for what bounces,
-    too: a piece that begins beside an impact leaves open on which side of it, and a ball that comes
-    to rest is searched for a minimum among hundreds of small bounces (minutes, on the exam's
-    updrafts).
+    A floating base is excluded, because its pose at the start of a segment is not known. A system
+    that bounces is excluded, too: for a segment that starts near an impact, the side of the impact
+    is ambiguous, and for a ball that comes to rest the fit searches among hundreds of small bounces
+    (this takes minutes in the updraft cases of the exam).
+
+    Args:
+        world: the whole runs.
+
+    Returns:
+        The segments as runs, or None if every run is too short for two segments, or if the system
+        has a floating base or bounces.
     """
     if world.simulator.system.bounces or world.simulator.system.afloat:
         return None
@@ -54,44 +64,51 @@ def pieces(world: World) -> World | None:
 
 
 def _cut(run: Run) -> list[Run]:
-    """The pieces of a run, the run itself where it is too short."""
-    # a sample counts where any of the channels has it
+    """Return the segments of a run, or the run itself if it is too short."""
+    # A time counts as sampled if any channel has a sample.
     values = np.stack(list(run.channels.values()))
     seen: Mask = np.any(np.isfinite(values), axis=0)
     count = int(np.clip(seen.sum() // LEAST, 1, PIECES))
     edges = np.linspace(0, run.times.size, count + 1).astype(int)
     parts = [slice(a, b) for a, b in pairwise(edges)]
-    # pieces are equally long, but samples may be missing in one of them
+    # Segments have equal length, but one of them may have too many missing samples.
     if any(seen[part].sum() < LEAST // HOLES for part in parts):
         return [run]
     return [run.part(part, f"{run.name}.{n}") for n, part in enumerate(parts)]
 
 
 def whole(world: World, found: Fit) -> Start:
-    """Where a fit of the whole runs begins, from a fit of their pieces."""
+    """Return the start of a fit of the whole runs from a fit of their segments.
+
+    Args:
+        world: the whole runs.
+        found: fit of the segments of `world`.
+
+    Returns:
+        The fitted parameters, with the initial states of the first segment of each run.
+    """
     counts = [len(_cut(run)) for run in world.runs]
-    # each run goes on from where its first piece began
+    # The initial state of a run is that of its first segment.
     first = np.cumsum([0, *counts])[:-1]
     return Start(found.effects, found.theta, found.states[first])
 
 
 def forgets(world: World, noise: Noise, derivatives: Array) -> bool:
-    """Whether the motion forgets how it began before its runs end: initial states act on the last
-    samples by a small share of what they act on any.
+    """Return whether initial states hardly influence the last samples of each run.
 
-    Then a fit of whole runs has no more minima than one of their pieces.
+    In that case a fit of whole runs has no more local minima than a fit of their segments.
 
     Args:
         world: the runs.
-        noise: of each channel.
-        derivatives: (R, T, C, s) of a model's runs by their initial states; zero where one is
-            known.
+        noise: noise of each channel.
+        derivatives: (R, T, C, s) derivatives of the simulated runs by their initial states; zero
+            for known states.
     """
     seen = np.isfinite(world.observed)[..., None]
     sizes = np.abs(np.where(seen, derivatives / noise.sigma[:, None], 0.0)).max(axis=2)
     for run, length in zip(sizes, world.lengths, strict=True):
         last = run[int((1.0 - LAST) * length) : int(length)]
-        # Of a beginning that is known nothing shows how long it acts.
+        # If all initial states of a run are known, the decay of their influence cannot be measured.
         if not run.any() or (last.max(axis=0) > FORGOTTEN * run.max(axis=0)).any():
             return False
     return True

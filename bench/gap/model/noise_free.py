@@ -1,9 +1,8 @@
-"""Recordings without sensor noise, such as simulated ones: white noise at the accuracy of a
-simulation is added before they are explained.
+"""Add white noise to recordings without sensor noise, such as simulated ones.
 
-Two exact simulations of one system differ by what their integrators neglect, 10^-9 to 10^-4 of a
-channel's range. Without noise every test would find this difference significant, and a search would
-explain the integrator. White noise of 10^-4 of the range (`floor.PRECISION`) covers it.
+Two exact simulations of one system differ by their integration errors, 10^-9 to 10^-4 of the range
+of a channel. Without noise, every test would find this difference significant, and a search would
+explain the integrator. White noise of 10^-4 of the range (`floor.PRECISION`) covers the difference.
 """
 
 from __future__ import annotations
@@ -20,19 +19,25 @@ from sims.base import Array
 from sims.recording.recording import Recording, Run
 
 ORDER = 8
-"""Order of the differences that take the motion out of a smooth signal: of a sine that is sampled
-ten times a period they leave 2 %, at a hundred samples 10^-10.
+"""Order of the differences that remove the motion from a smooth signal.
+
+At ten samples per period, 2 % of a sine remains; at a hundred samples, 10^-10.
 """
 FREE = 0.02
-"""A channel has no noise if the rest is below this share of the noise that would be added. Rounding
-to six digits is below it.
+"""Maximum remainder of a channel without noise, as a share of the noise that would be added.
+
+The remainder due to rounding to six digits is smaller.
 """
 
 
 def add_least_noise(recording: Recording, channels: Sequence[str]) -> tuple[Recording, list[str]]:
     """Add white noise of `PRECISION` of a channel's range to each channel without noise.
 
-    Channels that never change are left as they are.
+    Channels that never change are not modified.
+
+    Args:
+        recording: the recording.
+        channels: names of the channels to check.
 
     Returns:
         The recording, and the names of the channels that were changed.
@@ -45,18 +50,18 @@ def add_least_noise(recording: Recording, channels: Sequence[str]) -> tuple[Reco
 
 
 def _missing(recording: Recording, name: str) -> float:
-    """1 sigma of the noise that a channel lacks; 0 where it has noise, or is constant."""
+    """Return the standard deviation of the noise to add; 0 for noisy or constant channels."""
     signals = [(run.times, run.channels[name]) for run in recording.runs if name in run.channels]
     values = np.concatenate([y[np.isfinite(y)] for _, y in signals])
     least = PRECISION * range_of(values)
     if least < LEAST:
         return 0.0
-    # Unknown where all runs are shorter than a difference.
+    # The estimate is not finite if all runs are too short for the differences.
     return least if differences_sigma(signals, ORDER) < FREE * least else 0.0
 
 
 def _noisy(run: Run, sizes: dict[str, float]) -> Run:
-    """The run with white noise in some channels; the same for the same run and channel."""
+    """Return the run with white noise in some channels, reproducible for each run and channel."""
 
     def noise(name: str, values: Array) -> Array:
         return sizes[name] * rng_for("least noise", run.log, run.name, name).normal(

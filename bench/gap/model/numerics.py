@@ -1,11 +1,10 @@
-"""Is it the simulator's own step? How far a robot's simulation is from its own fine motion, and
-which step and integrator mend that.
+"""Discretisation error of a robot's time step, and finer steps and integrators that remove it.
 
-A model file states a time step and an integrator, and they are part of what it says: a motion that
-is stepped too coarsely is early by about half a step, or blows up where a servo is stiff. With q(h)
-the motion at a step h, a scheme is trusted as a reference where halving its step hardly changes it;
-where none is, the first-order error of an implicit one is taken out (L. F. Richardson, 1911,
-doi:10.1098/rsta.1911.0009):
+A model file specifies a time step and an integrator, and both affect the motion: with a coarse step
+the motion is early by about half a step, or a stiff servo becomes unstable. With the motion q(h) at
+step size h, a scheme is accepted as the reference if halving its step hardly changes the motion. If
+no scheme qualifies, the first-order error of an implicit scheme is extrapolated (L. F. Richardson,
+1911, doi:10.1098/rsta.1911.0009):
 
     q = 2 q(h / 2) - q(h)                                                                      (1)
 """
@@ -24,36 +23,40 @@ from sims.robot.numerics import Numerics
 from sims.robot.simulator import RobotSimulator
 
 MATTERS = 0.2
-"""RMS error in units of the noise from which the step is asked about."""
+"""Minimum RMS discretisation error, in units of the noise, at which finer steps are considered."""
 MENDED = 0.1
-"""RMS error below which a setting is taken to mend it."""
+"""Maximum RMS error, in units of the noise, of a setting that corrects the discretisation error."""
 ROUGH = 0.7
-"""The same where far more is left to explain; what remains of it is taken out when that is done
-(`bench.gap.model.tangents`).
+"""Maximum RMS error of a setting, in units of the noise, if the residual is much larger.
+
+The rest of the error is corrected after the fit (`bench.gap.model.tangents`).
 """
 LESS = 4.0
-"""And this many times smaller than that of the file's own step."""
+"""Minimum factor by which a setting with an error above `MENDED` must reduce the error.
+
+The reference is the error of the step of the model file.
+"""
 WITHIN = 0.05
-"""But no larger than this share of what the model leaves."""
+"""Maximum error of a setting above `MENDED`, as a share of the residual of the model."""
 TRUSTED = 0.03
-"""RMS change by halving the step below which a scheme is a reference."""
+"""Maximum RMS change by halving the step, in units of the noise, of a reference scheme."""
 FINEST = 10
-"""Parts of the model's own step that are tried at most."""
+"""Maximum number of divisions of the step of the model file."""
 ROBUST = "implicitfast"
-"""The integrator that stiff servos do not blow up."""
+"""Integrator that remains stable with stiff servos."""
 RUNS = 2
-"""Runs that are looked at: a step that is too coarse is so in all of them."""
+"""Number of runs that are checked; a step that is too coarse is so in all runs."""
 
 
 class Finer(NamedTuple):
-    """How the robot should be stepped.
+    """A finer step or better integrator for a robot.
 
     Attributes:
-        kind: its simulator, stepped so.
-        own: step and integrator of the file.
-        numerics: those that mend it.
-        error: RMS error of the file's own numerics in units of the noise.
-        rest: the same of those that mend it.
+        kind: its simulator with these settings.
+        own: step and integrator of the model file.
+        numerics: step and integrator that correct the error.
+        error: RMS discretisation error of `own`, in units of the noise.
+        rest: RMS discretisation error of `numerics`, in units of the noise.
     """
 
     kind: type[RobotSimulator]
@@ -63,19 +66,23 @@ class Finer(NamedTuple):
     rest: float
 
     def suits(self, left: float) -> bool:
-        """Whether its step is fine enough for a model that leaves so much, RMS in units of the
-        noise.
+        """Return whether the step is fine enough for a model with the given residual.
+
+        Args:
+            left: RMS residual of the model, in units of the noise.
         """
         return self.rest < max(MENDED, WITHIN * left)
 
 
 def finer(world: World, noise: Noise) -> Iterator[Finer]:
-    """Steps and integrators that follow the robot's own fine motion, the cheapest first, where the
-    file's do not; none where they do.
+    """Yield settings that reproduce the converged motion of the robot, the cheapest first.
+
+    Nothing is generated if the settings of the model file are accurate, or if no reference
+    converges.
 
     Args:
-        world: the runs, of a robot.
-        noise: of each channel.
+        world: the runs of a robot.
+        noise: noise of each channel.
     """
     kind = world.kind
     assert issubclass(kind, RobotSimulator)
@@ -94,7 +101,7 @@ def finer(world: World, noise: Noise) -> Iterator[Finer]:
 
 
 def _settings(own: Numerics) -> Iterator[Numerics]:
-    """Steps and integrators in the order of what they cost."""
+    """Yield steps and integrators in the order of their computational cost."""
     step, integrator = own
     cost = {"RK4": 3.3}
     tried = []
@@ -107,7 +114,7 @@ def _settings(own: Numerics) -> Iterator[Numerics]:
 
 
 class _Motions:
-    """The first runs as the robot makes them with any numerics, each simulated once."""
+    """Motions of the first runs with any step and integrator, each simulated once."""
 
     def __init__(self, world: World, noise: Noise, kind: type[RobotSimulator]) -> None:
         self._world, self._kind, self._noise = world, kind, noise
@@ -115,12 +122,13 @@ class _Motions:
         self._seen: dict[Numerics, Array] = {}
 
     def of(self, numerics: Numerics) -> Array:
-        """(R, T, C), NaN behind the end of a shorter run."""
+        """Return the motion (R, T, C), NaN after the end of a shorter run."""
         if numerics not in self._seen:
             self._seen[numerics] = self._simulated(numerics)
         return self._seen[numerics]
 
     def _simulated(self, numerics: Numerics) -> Array:
+        """Simulate the runs without effects at nominal parameters."""
         world = self._world
         kind = self._kind.stepped_by(numerics)
         simulator = kind(world.recording.constants, world.channels)
@@ -132,7 +140,7 @@ class _Motions:
         return simulator.simulate_lanes(theta, scenarios, states)
 
     def reference(self, own: Numerics) -> Array | None:
-        """The robot's fine motion; None where nothing converges."""
+        """Return the converged motion of the robot; None if no scheme converges."""
         for parts in (1, 2, 5):
             coarse, fine = (self.of(Numerics(own.timestep / n, "RK4")) for n in (parts, 2 * parts))
             if self.apart(coarse, fine) < TRUSTED:
@@ -147,7 +155,10 @@ class _Motions:
         return None
 
     def apart(self, one: Array, other: Array) -> float:
-        """RMS in units of the noise over the samples that both have; infinite where one fails."""
+        """Return the RMS difference in units of the noise; infinite if a simulation fails.
+
+        Only available samples of the recording are compared.
+        """
         there = [np.isfinite(track.observed) for track in self._tracks]
         squares = []
         for run, seen in enumerate(there):

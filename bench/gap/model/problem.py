@@ -1,24 +1,24 @@
-"""One model on its way to a least-squares fit: where it stands, and how boldly it goes on.
+"""State of one Levenberg-Marquardt fit: point, Jacobian, damping and convergence.
 
-A step that promised a decrease p of the cost F and brought it from F to F' has the gain ratio
+For a step with predicted decrease p that changed the cost from F to F', the gain ratio is
 
     ρ = (F - F') / p                                                                             (1)
 
-and the damping λ follows it by Nielsen's rule (H. B. Nielsen, Damping parameter in Marquardt's
-method, IMM-REP-1999-05), here quicker in both directions: his least factor is 1/3, his growth ν λ.
+The damping λ follows ρ by Nielsen's rule (H. B. Nielsen, Damping parameter in Marquardt's method,
+IMM-REP-1999-05), but it changes faster in both directions: the original minimum factor is 1/3, the
+original growth is ν λ.
 
-    λ ← λ max(0.1, 1 - (2ρ - 1)³),   ν ← 2        where F' < F, and the step is taken            (2)
-    λ ← 2ν λ,                        ν ← 2ν       where it is not                                (3)
+    λ ← λ max(0.1, 1 - (2ρ - 1)³),   ν ← 2        if F' < F, and the step is accepted            (2)
+    λ ← 2ν λ,                        ν ← 2ν       otherwise                                      (3)
 
-Derivatives J that cost much may serve for several steps. What a step δ changed beside what was
-expected is put into them, along the step alone, with D the scales of the unknowns (C. G. Broyden,
-Math. Comp. 19, 577, 1965, doi:10.1090/S0025-5718-1965-0198670-6; in this method: K. Madsen, H. B.
-Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems, 2004, section 3.3),
+Expensive derivatives J may be used for several steps. They are updated with the unpredicted part of
+the change by a step δ, along the step only; D are the scales of the unknowns (C. G. Broyden, Math.
+Comp. 19, 577, 1965, doi:10.1090/S0025-5718-1965-0198670-6; for this method: K. Madsen, H. B.
+Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems, 2004, section 3.3):
 
     J ← J + (y(x + δ) - y(x) - J δ) δᵀ D⁻² / (δᵀ D⁻² δ)                                          (4)
 
-and they are taken anew where steps no longer keep their promises: where ρ is far from 1, or F has
-grown.
+They are recomputed when predictions become poor: when ρ is far from 1, or F has increased.
 """
 
 from __future__ import annotations
@@ -34,76 +34,93 @@ from bench.gap.model.world import Indices
 from sims.base import Array
 
 ENOUGH = 0.02
-"""A fit has converged when a step lowers the sum of squares, in units of the noise, by less than
-this and the share below of it.
+"""Convergence threshold: minimum decrease of the sum of squares by a step, in units of the noise.
+
+A share of the sum of squares, `SHARE` or `COARSE_SHARE`, is added to it.
 """
 SHARE = 1e-4
-"""The share."""
+"""Convergence threshold as a share of the sum of squares, added to `ENOUGH`."""
 EXACT = 0.002
-"""The same of a fit whose numbers are told: so far from the lowest sum of squares, they are off by
-a twentieth of what noise makes of them.
+"""Convergence threshold of fits whose parameters are reported, in units of the noise.
+
+Parameters are then within a twentieth of a standard error of the optimum.
 """
 
-# The cost of a robot's fit is rough: a joint that sticks one integration step later changes it by
-# more than the fit can still gain. These constants end such fits.
+# The cost of a robot fit is not smooth: a joint that sticks one integration step later changes it
+# by more than the fit can still gain. These constants end such fits.
 COARSE_SHARE = 1e-3
-"""Convergence threshold as a share of the sum of squares, where the model is far from the data."""
+"""Convergence threshold as a share of the sum of squares, if the model is far from the data."""
 FAR = 2.0
-"""A model is far from the data above this mean squared residual, in units of the noise."""
+"""Mean squared residual, in units of the noise, above which a model is far from the data."""
 STAGNANT_RATIO = 0.3
 """Maximum gain ratio (1) of a step that ends a fit far from the data."""
 STAGNANT_SHARE = 5e-3
-"""Maximum gain of such a step, as a share of the sum of squares."""
+"""Maximum gain of a step that ends a fit far from the data, as a share of the sum of squares."""
 ROUGHNESS = 3.0
-"""A fit has converged where a step with derivatives of its own point promises less than this, in
-units of the noise, and gains nothing.
+"""Maximum predicted decrease, in units of the noise, at which a rejected step ends a rough fit.
+
+It applies to steps with derivatives of the present point.
 """
 EXACT_ROUGHNESS = 1.0
-"""The value of `ROUGHNESS` for fits whose parameters are reported."""
+"""Value that replaces `ROUGHNESS` in fits whose parameters are reported."""
 
 FIRST_DAMPING = 1e-3
-"""Where the λ of (2) begins."""
+"""Initial damping λ of (2)."""
 LEAST_DAMPING = 1e-10
-"""The lowest one: from zero, no factor would bring it back."""
+"""Minimum damping λ; a damping of zero could not grow again."""
 LARGEST_DAMPING = 1e8
-"""Above it no step downhill is to be found, however short."""
+"""Maximum damping λ; above it no step decreases the cost, however short."""
 GROWTH = 2.0
-"""Where the ν of (3) begins, and by what it grows."""
+"""Initial growth factor ν of (3), and the factor by which ν itself grows."""
 LEAST_FACTOR = 0.1
-"""The least factor of (2)."""
+"""Minimum factor of (2) by which the damping changes after an accepted step."""
 KEPT = 0.5
-"""Derivatives serve for another step while ρ is no farther from 1."""
+"""Maximum deviation of ρ from 1 at which derivatives are used for another step."""
 
 
 SHARED_RENEWALS = 2
-"""Number of renewals of the derivatives after which a model near the data gets derivatives by its
-initial states of its own.
+"""Number of recomputed Jacobians after which a fit gets its own derivatives by initial states.
+
+It applies to models near the data; other models share these derivatives.
 """
 
 
 class Known(NamedTuple):
-    """Derivatives (R, T, C, q) of the runs by some of the parameters, (q,) of theta, about a point
-    nearby.
+    """Known derivatives of the runs by some of the parameters, about a nearby point.
+
+    Attributes:
+        free: (q,) indices of these parameters in theta.
+        jacobian: (R, T, C, q) derivatives.
     """
 
     free: Indices
     jacobian: Array
 
     def without(self, places: Collection[int]) -> Known:
-        """Those by the others alone."""
+        """Return the derivatives without those by some parameters."""
         kept = [j for j, place in enumerate(self.free.tolist()) if place not in places]
         return Known(self.free[kept], self.jacobian[..., kept])
 
     def beside(self, places: Sequence[int], jacobian: Array) -> Known:
-        """With those by further parameters (R, T, C, k)."""
+        """Return the derivatives together with those by further parameters.
+
+        Args:
+            places: (k,) indices of the further parameters in theta.
+            jacobian: (R, T, C, k) derivatives by them.
+        """
         free = np.concatenate([self.free, np.array(places, dtype=np.intp)])
         return Known(free, np.concatenate([self.jacobian, jacobian], axis=3))
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit begins: the effects that act, parameters (P,), initial states (R, s); and what is
-    known of its derivatives already, if anything.
+    """Start of a fit.
+
+    Attributes:
+        effects: names of the active effects.
+        theta: (P,) parameters.
+        states: (R, s) initial states.
+        known: derivatives that are known near the start, if any.
     """
 
     effects: tuple[str, ...]
@@ -117,14 +134,14 @@ class Fit:
     """A fitted model.
 
     Attributes:
-        effects: which effects act.
+        effects: names of the active effects.
         theta: (P,) parameters and coefficients.
         states: (R, s) initial states.
-        free: (q,) which of theta were fitted.
-        simulated: (R, T, C).
-        jacobian: (R, T, C, q + s) its derivatives, initial states last.
+        free: (q,) indices of the fitted elements of theta.
+        simulated: (R, T, C) simulated observations.
+        jacobian: (R, T, C, q + s) derivatives of `simulated`, initial states last.
         cost: sum of squares of the whitened residual.
-        own: whether the derivatives are those of this very point.
+        own: whether the derivatives were computed at exactly this point.
     """
 
     effects: tuple[str, ...]
@@ -137,17 +154,17 @@ class Fit:
     own: bool = True
 
     def known(self) -> Known:
-        """Its derivatives by parameters, for what begins nearby."""
+        """Return the derivatives by the parameters, for use in fits that start nearby."""
         return Known(self.free, self.jacobian[..., : self.free.size])
 
     def start(self) -> Start:
-        """To go on from here."""
+        """Return a start that continues from this fit."""
         return Start(self.effects, self.theta, self.states)
 
 
 @dataclass(frozen=True)
 class Point:
-    """Where a model stands, and what it gives there; attributes as those of `Fit`."""
+    """A point of a fit and its simulation; attributes as those of `Fit`."""
 
     start: Start
     simulated: Array
@@ -157,27 +174,28 @@ class Point:
 
 @dataclass
 class Problem:
-    """One model on its way.
+    """State of the fit of one model.
 
     Attributes:
-        point: the best one so far.
-        free: (q,) which of theta are fitted.
-        low, high: (q,) where they may be.
-        widths: (q,) the ranges of their bounds.
-        steps: (q + s,) of the finite differences.
+        point: best point so far.
+        free: (q,) indices of the fitted elements of theta.
+        low: (q,) lower bounds of the fitted parameters.
+        high: (q,) upper bounds of the fitted parameters.
+        widths: (q,) widths of the plausible ranges of the parameters.
+        steps: (q + s,) step sizes of finite differences.
         damping: λ.
         growth: ν.
-        promised: decrease of the cost that the last step promised.
-        done: whether it has converged, or is given up.
-        here: whether the point's derivatives are its own, and not those of another one.
-        stale: whether they have to be taken anew before it goes on.
-        waits: whether that can wait until it is known that it is not far behind.
-        exact: whether it goes on until `EXACT`.
-        rough: whether its cost is not smooth at the scale of the noise.
+        promised: predicted decrease of the cost by the last step.
+        done: whether the fit has converged or was eliminated.
+        here: whether the derivatives were computed at the present point, and not at another one.
+        stale: whether the derivatives must be recomputed before the next step.
+        waits: whether recomputing can wait until the fit is known not to be far behind others.
+        exact: whether the fit continues to the threshold `EXACT`.
+        rough: whether the cost is not smooth at the scale of the noise.
         samples: number of samples that count.
-        renewals: number of times that derivatives were taken anew.
-        by_states: (R, T, C, s) derivatives by initial states about this model; None for those that
-            all models share.
+        renewals: number of times the derivatives were recomputed.
+        by_states: (R, T, C, s) derivatives by initial states about this model; None to use those
+            that all models share.
     """
 
     point: Point
@@ -201,24 +219,26 @@ class Problem:
 
     @property
     def needs_own_states(self) -> bool:
-        """Whether derivatives by initial states that all models share do not serve this one: near
-        the data it has needed new ones for its parameters again and again.
+        """Whether the derivatives by initial states that all models share are not good enough.
+
+        This is the case if the model is near the data, but its derivatives by parameters had to be
+        recomputed several times.
         """
         slow = self.rough and self.by_states is None and self.renewals >= SHARED_RENEWALS
         return slow and not self._is_far(self.point.cost)
 
     def enough(self, cost: float) -> float:
-        """By less than this a step need not lower the cost."""
+        """Return the convergence threshold: minimum decrease of the cost by a step."""
         if self.exact:
             return EXACT
         return ENOUGH + (COARSE_SHARE if self._is_far(cost) else SHARE) * cost
 
     def _is_far(self, cost: float) -> bool:
-        """Whether a rough fit is far from the data."""
+        """Return whether a fit with a rough cost is far from the data."""
         return self.rough and cost > FAR * self.samples
 
     def fit(self) -> Fit:
-        """What has been fitted by now."""
+        """Return the present result of the fit."""
         at = self.point
         return Fit(
             at.start.effects,
@@ -232,33 +252,39 @@ class Problem:
         )
 
     def inward(self, theta: Array) -> Array:
-        """(q + s,) the steps from parameters (P,), with their signs: inward at an upper bound."""
+        """Return signed difference steps (q + s,) from parameters (P,).
+
+        The step of a parameter at its upper bound points inward.
+        """
         steps = self.steps.copy()
         own = steps[: self.free.size]
         own[theta[self.free] + own > self.high] *= -1.0
         return steps
 
     def learnt(self, reached: Point) -> Array:
-        """(R, T, C, q + s) derivatives at a point that a step has reached, by what it has shown
-        beside those that it began with: (4), run by run.
+        """Return derivatives (R, T, C, q + s) at a new point by Broyden's update (4), run by run.
+
+        Args:
+            reached: the point that the step has reached.
         """
         at = self.point
-        # What nobody simulates, behind the end of a shorter run, has not changed.
+        # Samples after the end of a shorter run are NaN, and count as unchanged.
         shown = np.nan_to_num(reached.simulated - at.simulated)
         shared = (reached.start.theta - at.start.theta)[self.free]
         own = reached.start.states - at.start.states
         moved = np.concatenate([np.broadcast_to(shared, (len(own), shared.size)), own], axis=1)
         weighed = moved / np.square(self.steps)
         length = np.sum(weighed * moved, axis=1)
-        # A run of which nothing was moved shows nothing.
+        # A run in which nothing was moved gives no information.
         along = weighed / np.where(length > 0, length, np.inf)[:, None]
         missed = shown - np.einsum("rtcq,rq->rtc", at.jacobian, moved)
         learnt: Array = at.jacobian + missed[..., None] * along[:, None, None, :]  # (4)
         return learnt
 
     def finish(self) -> None:
-        """It has converged, as far as its derivatives tell: those of another point have to be taken
-        anew before it is believed.
+        """Mark the fit as converged if its derivatives belong to the present point.
+
+        Otherwise the derivatives must be recomputed first.
         """
         if self.here:
             self.done = True
@@ -266,12 +292,12 @@ class Problem:
             self.stale = self.waits = True
 
     def taken(self, gained: float, cost: float, own: bool) -> None:
-        """Learn from a step that brought the cost down.
+        """Update the damping and the convergence state after an accepted step.
 
         Args:
-            gained: by how much.
-            cost: to which.
-            own: whether the derivatives were those of the very point where the step began.
+            gained: decrease of the cost.
+            cost: new cost.
+            own: whether the derivatives were computed at the point where the step began.
         """
         ratio = gained / max(self.promised, 1e-300)  # (1)
         self.stale = not self.here and abs(ratio - 1.0) > KEPT
@@ -281,12 +307,12 @@ class Problem:
         stagnant = ratio < STAGNANT_RATIO and gained < STAGNANT_SHARE * cost
         if own and not self.exact and stagnant and self._is_far(cost):
             self.done = True
-        # With derivatives of its own it has converged; with others it may have.
+        # With derivatives of the present point the fit has converged; with others it may have.
         if gained < self.enough(cost):
             self.finish()
 
     def refused(self) -> None:
-        """After a step that did not, (3), unless its derivatives were to blame."""
+        """Increase the damping (3) after a rejected step, unless outdated derivatives caused it."""
         if not self.here:
             self.stale = True
             return
@@ -297,8 +323,13 @@ class Problem:
         self.growth = GROWTH * self.growth
 
     def stuck(self, residual: Array, jacobian: Array) -> Mask:
-        """(q,) parameters at a bound that the data push against."""
-        # the gradient of the cost, downhill
+        """Return the mask (q,) of parameters at a bound that the data push against.
+
+        Args:
+            residual: (R, T, C) whitened residual.
+            jacobian: (R, T, C, q + s) whitened derivatives.
+        """
+        # Direction of steepest descent of the cost.
         pushed = np.einsum("rtc,rtcq->q", residual, jacobian[..., : self.free.size])
         here = self.point.start.theta[self.free]
         below = (here <= self.low) & (pushed < 0)

@@ -1,4 +1,4 @@
-"""Fits that race: who falls far behind is given up, and all hear of the best now and then."""
+"""Racing of fits: share the best cost between rounds and stop fits that fall far behind."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import NamedTuple
 from bench.gap.model.problem import Problem
 
 RACED = 4
-"""Steps after which a model can be so far behind that it is given up."""
+"""Minimum number of iterations before a fit can be eliminated."""
 LEG = 3
-"""Steps after which those who race hear of each other."""
+"""Number of iterations per racing round; the best cost is shared between rounds."""
 BEATEN = 100.0
-"""A model is given up whose sum of squares, less what may be hoped for, is so much above the best
-one's.
+"""Margin of the sum of squares, in units of the noise variance, beyond which a fit is eliminated.
+
+It compares the optimistic final cost of the fit (see `HOPE`) with the best cost.
 """
 HOPE = 10.0
-"""What may be hoped for, in multiples of what the next step promises."""
+"""Decrease of the cost that a fit may still reach, as a multiple of its next predicted decrease."""
 
 
 class Leg(NamedTuple):
-    """Steps from the first until the last, which is not made any more, of so many in all."""
+    """Iterations `first` to `last` (exclusive) of a fit with `all` iterations in total."""
 
     first: int
     last: int
@@ -28,7 +29,13 @@ class Leg(NamedTuple):
 
 
 def legs(iterations: int, race: bool) -> Iterator[Leg]:
-    """The way of a fit: in legs where models race, who hear of each other between them."""
+    """Yield the rounds of a fit.
+
+    Args:
+        iterations: total number of iterations; with 0, one empty round is generated.
+        race: whether the fits race, and so exchange their best cost after each short round.
+            Otherwise there is only one round.
+    """
     first = 0
     while first < iterations or not first:
         last = iterations
@@ -41,7 +48,12 @@ def legs(iterations: int, race: bool) -> Iterator[Leg]:
 
 
 def give_up(problems: Sequence[Problem], reached: float) -> None:
-    """Leave models unfinished that several steps like the last would not bring near the best."""
+    """Mark fits as done if several more steps would not bring them close to the best cost.
+
+    Args:
+        problems: states of the fits; `done` is set in place.
+        reached: lowest cost of other fits.
+    """
     best = min(reached, *(p.point.cost for p in problems))
     for p in problems:
         p.done |= p.point.cost - HOPE * p.promised > best + BEATEN

@@ -1,17 +1,18 @@
-"""Noise that means nothing but has the spectrum of what a model leaves: a sieve bootstrap.
+"""Surrogate residuals: random noise with the spectrum of a residual (sieve bootstrap).
 
-Each channel is fitted by an autoregression whose order Akaike's criterion picks, and driven again
-by its own resampled innovations (P. Buhlmann, Bernoulli 3(2), 123, 1997, doi:10.2307/3318584):
+Each channel is fitted by an autoregression, whose order is selected by Akaike's criterion, and
+simulated with its own resampled innovations (P. Buhlmann, Bernoulli 3(2), 123, 1997,
+doi:10.2307/3318584):
 
     e_t = Σ_k a_k e_{t-k} + u_t                                                                  (1)
 
-Of a short run a fit takes the slow part of the noise with it, so that what is left seems to
-remember less than the noise does, and scores that slow changes reach by chance would be thought
-rare. What the same fit leaves of a first set of surrogates says by how much, and a second set is
-driven without that bias (bootstrap after bootstrap; L. Kilian, Rev. Econ. Stat. 80(2), 218, 1998,
-doi:10.1162/003465398557465), with a* the weights that the first set's leavings seem to have:
+In a short run, the fit absorbs the slow part of the noise. The residual then seems less correlated
+than the noise is, and scores that slow changes reach under the null hypothesis would seem too rare.
+This bias is estimated by applying the same fit to a first set of surrogates, and a second set is
+generated without it (bootstrap after bootstrap; L. Kilian, Rev. Econ. Stat. 80(2), 218, 1998,
+doi:10.1162/003465398557465). With a* the weights estimated from the residuals of the first set:
 
-    a ← a + s (a - a*),   s the largest share of 1 whose noise dies away                         (2)
+    a ← a + s (a - a*),   s the largest share of 1 for which the process is stationary           (2)
 """
 
 from __future__ import annotations
@@ -24,25 +25,28 @@ from bench.gap.model.noise import TINY, Mask
 from sims.base import Array
 
 BURN_IN = 200
-"""Samples that a surrogate is driven by before it counts, to forget that it began with nothing."""
+"""Number of initial samples of a surrogate that are discarded, to remove its zero initial state."""
 RIDGE = 1e-9
 """Share of the variance added to the Yule-Walker matrix, which a pure tone makes singular."""
 STATIONARY = 0.999
-"""Largest root of an autoregression that is taken, in magnitude: from 1 on it does not die away."""
+"""Maximum modulus of the roots of an autoregression; from 1 on the process is not stationary."""
 GAINED = 1e-9
-"""An order must lower Akaike's criterion by more than this, else rounding would choose it."""
+"""Minimum decrease of Akaike's criterion by a higher order; smaller ones are due to rounding."""
 SHARES = tuple(share / 20.0 for share in range(20, 0, -1))
-"""Shares of a bias that are taken out, the largest first that leaves noise which dies away."""
+"""Shares of the bias correction to try, largest first, until the process is stationary."""
 PILOTS = (20, 100)
-"""Surrogates of the first set, at least and at most."""
+"""Minimum and maximum number of surrogates of the first set, which estimates the bias."""
 PILOTED = 20_000
-"""So many samples of theirs say what the bias is: it is less than their error where it is small."""
+"""Target number of samples of the first set.
+
+A bias that is smaller than its error of estimation does not matter.
+"""
 NUMBERS = 500_000
-"""Numbers that are driven at once: more would not stay in the cache."""
+"""Maximum number of values that are simulated at once; more would not fit in the CPU cache."""
 WIDTH = 1_000
-"""But so many side by side at least, or each step would cost more than its numbers."""
+"""Minimum number of series that are simulated in parallel, so that the cost per step is low."""
 FEWEST = 10
-"""Innovations from which surrogates are drawn at least; of fewer the samples themselves are."""
+"""Minimum number of innovations to resample; with fewer, the samples themselves are resampled."""
 
 
 def surrogates(
@@ -53,19 +57,20 @@ def surrogates(
     largest: int = 6,
     left: Callable[[Array], Array] | None = None,
 ) -> Array:
-    """Residuals (count, R, T, C) of the same spectrum that mean nothing.
+    """Draw residuals (count, R, T, C) with the spectrum of a given residual.
 
     Args:
-        residual: (R, T, C) what a model leaves, zero where nothing was seen.
-        seen: (R, T, C) which samples there are; the surrogates are zero elsewhere.
-        count: how many.
-        rng: draws the innovations.
-        largest: order that an autoregression has at most.
-        left: what a fit leaves of noises (count, R, T, C); without it nothing is corrected.
+        residual: (R, T, C) residual of a model, zero where no sample exists.
+        seen: (R, T, C) mask of available samples; the surrogates are zero elsewhere.
+        count: number of surrogates.
+        rng: random numbers for the innovations.
+        largest: maximum order of the autoregression.
+        left: callback that returns the residual of a fit to noise (count, R, T, C); without it the
+            bias is not corrected.
     """
     channels = residual.shape[2]
     weights = [_autoregression(residual[..., c], seen[..., c], largest) for c in range(channels)]
-    # White noise has nothing to remember less of.
+    # White noise has no correlation that a fit could reduce.
     if left is not None and any(w.size for w in weights):
         pilots = int(np.clip(PILOTED // max(int(seen.sum()), 1), *PILOTS))
         leavings = left(_drawn(residual, seen, weights, pilots, rng))
@@ -77,8 +82,17 @@ def surrogates(
 def _drawn(
     residual: Array, seen: Mask, weights: Sequence[Array], count: int, rng: np.random.Generator
 ) -> Array:
-    """(count, R, T, C) autoregressions (1) with weights (p,) of each channel, driven by resampled
-    innovations of a residual.
+    """Simulate the autoregressions (1) with resampled innovations of a residual.
+
+    Args:
+        residual: (R, T, C) residual.
+        seen: (R, T, C) mask of available samples.
+        weights: weights (p,) of each channel.
+        count: number of surrogates.
+        rng: random numbers for the innovations.
+
+    Returns:
+        Surrogates (count, R, T, C).
     """
     runs, length, channels = residual.shape
     result = np.zeros((count, runs, length, channels))
@@ -90,19 +104,25 @@ def _drawn(
         for first in range(0, count, step):
             some = result[first : first + step, :, :, c]
             drawn = rng.choice(innovations, size=(length + BURN_IN, len(some), runs))
-            # time comes first in what is driven, and last here
+            # Time is the first axis of the simulation, and the last axis here.
             driven = np.moveaxis(_driven(own, drawn)[BURN_IN:], 0, 2)
             some[...] = np.where(here, driven, 0.0)
     return result
 
 
 def _unbiased(weights: Array, leavings: Array, seen: Mask) -> Array:
-    """Weights (p,) by (2), of what a fit leaves (count, R, T) of noises that these have made."""
+    """Correct weights (p,) for the bias of a fit, by (2).
+
+    Args:
+        weights: (p,) weights of an autoregression.
+        leavings: (count, R, T) residuals of the fit to noise with these weights.
+        seen: (R, T) mask of available samples.
+    """
     order = weights.size
     count, *shape = leavings.shape
     covariances = _autocovariances(leavings.reshape(-1, shape[1]), np.tile(seen, (count, 1)), order)
     found, _ = _yule_walker(covariances, order)
-    # no such autoregression: nothing is known of the bias
+    # If no autoregression of this order is found, the bias is unknown.
     if found.size != order:
         return weights
     for share in SHARES:
@@ -113,14 +133,14 @@ def _unbiased(weights: Array, leavings: Array, seen: Mask) -> Array:
 
 
 def _driven(weights: Array, innovations: Array) -> Array:
-    """The autoregression (1) of innovations (T, ...), in their place."""
+    """Apply the autoregression (1) to innovations (T, ...), in place."""
     order = weights.size
     if not order:
         return innovations
     flat = innovations.reshape(len(innovations), -1)
-    # the oldest first, as samples stand
+    # The weight of the oldest sample comes first, in the order of the samples.
     backwards = weights[::-1]
-    # a sample reads those before it, which are finished by then
+    # A sample depends only on earlier ones, which are complete by then.
     for t in range(1, len(flat)):
         before = flat[max(t - order, 0) : t]
         flat[t] += backwards[order - len(before) :] @ before
@@ -128,7 +148,7 @@ def _driven(weights: Array, innovations: Array) -> Array:
 
 
 def _autoregression(values: Array, seen: Mask, largest: int) -> Array:
-    """Weights (p,) of an autoregression of values (R, T); none where too few could drive it."""
+    """Fit an autoregression to values (R, T); no weights if it has too few innovations."""
     filled = np.where(seen, values, 0.0)
     covariances = _autocovariances(filled, seen, min(largest, seen.shape[1] - 1))
     weights = _most_plausible(covariances, int(seen.sum()))
@@ -136,22 +156,22 @@ def _autoregression(values: Array, seen: Mask, largest: int) -> Array:
 
 
 def _centred(filled: Array, seen: Mask, weights: Array) -> Array:
-    """(n,) innovations by weights (p,) less their mean; the samples themselves if too few."""
+    """Return the innovations (n,) minus their mean; the samples themselves if there are too few."""
     innovations = _innovations(filled, seen, weights)
     if innovations.size < FEWEST:
         return filled[seen] if seen.any() else np.zeros(1)
-    # a mean of theirs would add up to an offset of the surrogates
+    # A nonzero mean would accumulate to an offset of the surrogates.
     centred: Array = innovations - innovations.mean()
     return centred
 
 
 def _autocovariances(filled: Array, seen: Mask, largest: int) -> Array:
-    """(largest + 1,) covariances of values (R, T) with those so many samples later, lag 0 first."""
+    """Return the autocovariances (largest + 1,) of values (R, T), lag 0 first."""
     length = seen.shape[1]
     covariances = []
     for lag in range(largest + 1):
         former, latter = slice(0, length - lag), slice(lag, length)
-        # what is missing adds nothing to the sum, so it must not count either
+        # Missing samples add nothing to the sum, so their pairs are not counted either.
         pairs = seen[:, latter] & seen[:, former]
         products = filled[:, latter] * filled[:, former]
         covariances.append(float(products.sum()) / max(int(pairs.sum()), 1))
@@ -159,7 +179,7 @@ def _autocovariances(filled: Array, seen: Mask, largest: int) -> Array:
 
 
 def _most_plausible(covariances: Array, count: int) -> Array:
-    """Weights (p,) of the order p that H. Akaike's criterion (1974) picks, n log var u + 2 p."""
+    """Return weights (p,) of the order p with the lowest n log var u + 2 p (H. Akaike, 1974)."""
     best = np.inf
     weights = np.zeros(0)
     for order in range(len(covariances)):
@@ -172,10 +192,10 @@ def _most_plausible(covariances: Array, count: int) -> Array:
 
 
 def _innovations(filled: Array, seen: Mask, weights: Array) -> Array:
-    """(n,) the u of (1), where all samples are there that it needs."""
+    """Return the innovations (n,) u of (1), where all samples that they need are available."""
     order, length = weights.size, seen.shape[1]
     predicted = np.zeros(1)
-    # a sample and all that it is predicted from
+    # A sample and all samples that predict it.
     complete = seen[:, order:]
     for k, weight in enumerate(weights, start=1):
         earlier = slice(order - k, length - k)
@@ -186,22 +206,22 @@ def _innovations(filled: Array, seen: Mask, weights: Array) -> Array:
 
 
 def _yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
-    """Weights (p,) of an autoregression from covariances γ, and the variance of its innovations.
+    """Solve the Yule-Walker equations for weights (p,) and the variance of the innovations.
 
-    The equations of Yule and Walker (Box & Jenkins, chapter 3):
+    With autocovariances γ (Box & Jenkins, chapter 3):
 
         Σ_l γ_|k-l| a_l = γ_k,   var u = γ_0 - Σ_k a_k γ_k                                       (3)
 
-    The variance is infinite where (1) would not die away, so that nothing prefers it.
+    The variance is infinite if (1) is not stationary, so that this order is not selected.
     """
     power = covariances[0]
-    # white, or nothing at all
+    # Order zero is white noise; without power there is no signal.
     if order == 0 or power <= 0:
         return np.zeros(0), float(power)
     numbers = np.arange(order)
     lags = np.abs(numbers[:, None] - numbers)
     later = covariances[1 : order + 1]
-    # (3), the matrix first
+    # Left-hand matrix of (3), with a ridge.
     matrix = covariances[lags] + RIDGE * power * np.eye(order)
     weights = np.linalg.solve(matrix, later)
     variance = float(power - weights @ later)
@@ -211,6 +231,6 @@ def _yule_walker(covariances: Array, order: int) -> tuple[Array, float]:
 
 
 def _root(weights: Array) -> float:
-    """The largest root, in magnitude: what (1) makes of one innovation is a sum of their powers."""
+    """Return the largest modulus of the roots; the response of (1) is a sum of their powers."""
     roots = np.roots(np.concatenate([[1.0], -weights]))
     return float(np.abs(roots).max(initial=0.0))

@@ -1,6 +1,4 @@
-"""What a robot's simulator tells without simulating each change: the tangents of its runs, and what
-its own step leaves of them.
-"""
+"""Linearised robot runs: responses to effects and initial states, and discretisation correction."""
 
 from __future__ import annotations
 
@@ -17,20 +15,25 @@ from sims.robot.series import is_series
 from sims.robot.simulator import RobotSimulator
 
 SMALL = 1.0
-"""RMS, in units of the noise, below which what the engine's step leaves can be taken out."""
+"""Maximum RMS discretisation error that is corrected, in units of the noise."""
 
 
 def responses(
     world: World, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
 ) -> Array:
-    """What one more effect changes about the runs, to first order: (K, R, T, C). In single
-    precision, since it is the largest array of explain by far, and a derivative.
+    """Compute the first-order responses of the runs to one additional effect each.
+
+    The result has single precision, because it is by far the largest array of an explanation and
+    only a derivative.
 
     Args:
-        world: the runs, of a robot.
-        theta: (P,) parameters, without the effects that are added.
+        world: the runs of a robot.
+        theta: (P,) parameters, without the added effects.
         states: (R, s) initial states.
         added: K effects with their coefficients.
+
+    Returns:
+        Changes of the runs (K, R, T, C); NaN where they are not finite.
     """
     runs, length, channels = world.observed.shape
     result: Array = np.full((len(added), runs, length, channels), np.nan, dtype=np.float32)
@@ -39,7 +42,7 @@ def responses(
     asked = [i for i, key in enumerate(keys) if key not in kept]
     calls = [(run, theta, states[run], [added[i] for i in asked]) for run in range(runs)]
     for run, (values, looks) in world.crew.each(world, _responses, calls):
-        # what explodes is infinite then
+        # Values that overflow single precision become infinite here.
         with np.errstate(over="ignore"):
             result[asked, run, : values.shape[1]] = values
         world.simulations += looks
@@ -48,7 +51,8 @@ def responses(
         if key in kept:
             result[i] = kept[key]
         elif is_series(world.effects[key[0]]):
-            # What is simulated for want of a tangent acts alike in all models near the data.
+            # Responses without a linearisation are simulated, and are similar in all models near
+            # the data.
             kept[key] = result[i].copy()
     return result
 
@@ -56,23 +60,23 @@ def responses(
 def _responses(
     world: World, run: int, theta: Array, states: Array, added: Sequence[tuple[str, Array]]
 ) -> tuple[Array, int]:
-    """The same of one run (K, T, C), and how many simulations it cost."""
+    """Compute the responses of one run (K, T, C), and the number of simulations used."""
     about = _about(world, run, theta, states)
     return about.responses([(world.effects[name], c) for name, c in added])
 
 
 def begun(world: World, theta: Array, states: Array, anew: bool = False) -> Array:
-    """Derivatives of the runs by their initial states, (R, T, C, s): those about the first
-    model that was asked for, or about this one.
+    """Return derivatives (R, T, C, s) of the runs by their initial states.
 
-    Initial states act alike in all models that are near the data, and a fit that has their
-    derivatives about another of them comes to the same end.
+    They are those about the first requested model, or about this one if `anew` is set. Initial
+    states act similarly in all models near the data, and a fit with derivatives of another such
+    model converges to the same result.
 
     Args:
-        world: the runs, of a robot.
+        world: the runs of a robot.
         theta: (P,) parameters.
         states: (R, s) initial states.
-        anew: take them about this model, and keep them.
+        anew: whether to recompute the derivatives about this model and store them.
     """
     if world.derivatives is None or anew:
         world.derivatives = begun_about(world, theta, states)
@@ -80,12 +84,12 @@ def begun(world: World, theta: Array, states: Array, anew: bool = False) -> Arra
 
 
 def begun_about(world: World, theta: Array, states: Array) -> Array:
-    """Return the derivatives (R, T, C, s) of the runs by their initial states about one model.
+    """Compute the derivatives (R, T, C, s) of the runs by their initial states about one model.
 
     Args:
-        world: the runs, of a robot.
-        theta: (P,) its parameters.
-        states: (R, s) its initial states.
+        world: the runs of a robot.
+        theta: (P,) parameters of the model.
+        states: (R, s) initial states of the model.
     """
     runs, length, channels = world.observed.shape
     result = np.zeros((runs, length, channels, len(world.states)))
@@ -97,12 +101,12 @@ def begun_about(world: World, theta: Array, states: Array) -> Array:
 
 
 def _begun(world: World, run: int, theta: Array, states: Array) -> Array:
-    """The same of one run, (s, T, C)."""
+    """Compute the derivatives (s, T, C) of one run by its initial states."""
     return _about(world, run, theta, states).begun()
 
 
 def _about(world: World, run: int, theta: Array, states: Array) -> Linear:
-    """The neighbourhood of one run of a model, which is asked more than once about most."""
+    """Return the linearisation of one run, cached because most are used more than once."""
     key = run, theta.tobytes(), states.tobytes()
     kept = world.neighbourhoods
     about: Linear | None = kept.pop(key, None)
@@ -111,29 +115,29 @@ def _about(world: World, run: int, theta: Array, states: Array) -> Linear:
         scenario = world.tracks[run].scenario
         about = Linear(world.simulator, theta, scenario, states[:half], states[half:])
     kept[key] = about
-    # Those that have not been asked for longest go.
+    # Drop the linearisations that were not used for the longest time.
     for old in list(kept)[: -len(world.tracks)]:
         del kept[old]
     return about
 
 
 def correct(world: World, noise: Noise, theta: Array, states: Array) -> None:
-    """Take out of all that is simulated from now on what the engine's own step leaves of a model's
-    motion.
+    """Correct all later simulations for the discretisation error of a model's motion.
 
-    With q(h) the motion at a step h, what is left by it is
+    With the motion q(h) at step size h, the discretisation error is
 
         2 q(h / 4) - q(h / 2) - q(h)                                                           (1)
 
-    to first order of h (L. F. Richardson, 1911, doi:10.1098/rsta.1911.0009), and nearly so of any
-    higher order. Below what would be asked about as a cause it is no cause, and yet would look like
-    one: dry friction that stops within a step and not at its end, a servo that is nearly too quick.
+    to first order in h (L. F. Richardson, 1911, doi:10.1098/rsta.1911.0009), and approximately for
+    any higher order. An error below `SMALL` is not reported as a cause, but could be mistaken for
+    one: for example dry friction that stops within a step and not at its end, or a servo that is
+    nearly too fast for the step.
 
     Args:
-        world: the runs, of a robot.
-        noise: of each channel.
-        theta: (P,) parameters of a model that is near the data.
-        states: (R, s) its initial states.
+        world: the runs of a robot.
+        noise: noise of each channel.
+        theta: (P,) parameters of a model near the data.
+        states: (R, s) initial states of the model.
     """
     if not world.linear:
         return
@@ -151,6 +155,6 @@ def correct(world: World, noise: Noise, theta: Array, states: Array) -> None:
     world.simulations += 7 * runs
     left = 2.0 * seen[2] - seen[1] - seen[0]  # (1)
     sizes = np.square(left / noise.sigma)[np.isfinite(world.observed)]
-    # What is not small is none that could be taken out.
+    # A large error cannot be removed by this correction.
     if float(np.sqrt(sizes.mean())) < SMALL:
         world.correction = np.nan_to_num(left)

@@ -1,8 +1,8 @@
-"""Long runs with fewer samples: every n-th one, as far apart as the engine's longest step.
+"""Subsampling of long runs: keep every n-th sample, at most one longest engine step apart.
 
-Motion that is sampled much more often than it changes costs a search many steps and tells it little
-more. Of every n samples the first is kept, and an input holds its mean over them, which carries the
-same momentum as the inputs that it stands for.
+If motion is sampled much faster than it changes, a search takes many steps and gains little
+information. The first of every n samples is kept, and an input is replaced by its mean over them,
+which transfers the same momentum as the original input.
 """
 
 from __future__ import annotations
@@ -16,18 +16,25 @@ from sims.base import Array
 from sims.recording.recording import Run
 
 LONG = 12_000
-"""Samples of all runs together from which they are thinned."""
+"""Minimum total number of samples of all runs for which they are thinned."""
 LEFT = 2_000
-"""So many are left of them at least."""
+"""Minimum total number of samples after thinning."""
 SHOWN = 0.5
-"""Share of a channel's samples, of those that thinning leaves, that must be there: one that is
-sampled seldom might else lose them all.
+"""Minimum number of samples of a channel after thinning, as a share of the expected number.
+
+A channel that is sampled rarely might otherwise lose all its samples.
 """
 
 
 def thinned(world: World) -> World | None:
-    """The world with fewer samples of the same runs, and the same parameters; None where there are
-    few, or where they are as far apart as steps already.
+    """Return a `World` with thinned runs and the same parameters.
+
+    Args:
+        world: the runs.
+
+    Returns:
+        The thinned runs, or None if there are few samples, if the sample interval is already as
+        long as an engine step, or if a channel would lose too many samples.
     """
     total = int(world.lengths.sum())
     most = total // LEFT
@@ -43,7 +50,7 @@ def thinned(world: World) -> World | None:
 
 
 def _factor(run: Run) -> int:
-    """How many of its intervals a step may hold."""
+    """Return the number of sample intervals within one engine step."""
     intervals = np.diff(run.times)
     if not intervals.size:
         return 1
@@ -51,7 +58,7 @@ def _factor(run: Run) -> int:
 
 
 def _every(run: Run, factor: int) -> Run:
-    """The run with every n-th sample."""
+    """Return the run with every n-th sample; n is `factor`."""
     first = np.arange(0, run.times.size, factor)
     return replace(
         run,
@@ -63,16 +70,16 @@ def _every(run: Run, factor: int) -> Run:
 
 
 def _means(times: Array, values: Array, first: Indices) -> Array:
-    """The mean of an input from each of the kept samples to the next; behind the last its value."""
+    """Return the mean of an input between kept samples; the value itself after the last one."""
     lasting = np.diff(times, append=times[-1])
-    # the last sample lasts for nothing: a hair of time keeps its block from being 0 / 0
+    # The last sample has no duration; a tiny one avoids 0 / 0 in its block.
     lasting[-1] = 1e-9 * max(float(times[-1] - times[0]), 1e-9)
     means: Array = np.add.reduceat(values * lasting, first) / np.add.reduceat(lasting, first)
     return means
 
 
 def _shown(few: Run, run: Run, factor: int) -> bool:
-    """Whether every channel has kept about its part of the samples."""
+    """Return whether every channel keeps about its expected number of samples."""
     for name, values in run.channels.items():
         before = int(np.isfinite(values).sum())
         left = int(np.isfinite(few.channels[name]).sum())

@@ -1,10 +1,10 @@
 """Plausible ranges of times and frequencies, from the time scale of a recording.
 
-With T the duration of the longest run and h the shortest sample interval,
+With T the duration of the longest run and h the shortest sample interval:
 
-* a delay or a lag is plausible up to a twentieth of T, and a fit may move it up to T: what takes
-  longer than a run is a constant in it;
-* a time constant of something that dies away is at most `LASTING` T;
+* a delay or a lag is plausible up to T / 20, and a fit may move it up to T: longer ones look
+  constant within a run;
+* a decay time constant is at most `LASTING` T;
 * a frequency is at most 1 / (2 h), the Nyquist frequency.
 """
 
@@ -15,20 +15,20 @@ from dataclasses import replace
 from sims.base import Parameter
 
 SHARE = 0.05
-"""A delay or a lag is plausible up to this share of the longest run."""
+"""Maximum plausible delay or lag, as a share of the duration of the longest run."""
 LASTING = 3.0
-"""Longest time constant that is tried of what dies away, in durations of the longest run."""
+"""Maximum decay time constant, as a multiple of the duration of the longest run."""
 DECADES = 100.0
-"""Ratio of the highest to the lowest plausible frequency where the sampling sets the highest."""
+"""Ratio of the highest to the lowest plausible frequency if the sampling limits the highest one."""
 
 
 def on_time_scale(parameter: Parameter, longest: float, spacing: float) -> Parameter:
-    """The coefficient with a plausible range that suits the time scale of a recording.
+    """Return the coefficient with a plausible range for the time scale of a recording.
 
     Args:
-        parameter: a coefficient, with the range that its effect states.
+        parameter: a coefficient, with the range that its effect specifies.
         longest: duration of the longest run, s.
-        spacing: shortest sample interval, s; 0 where it is not known.
+        spacing: shortest sample interval, s; 0 if unknown.
     """
     low, high = parameter.bounds
     if is_instant(parameter):
@@ -37,7 +37,7 @@ def on_time_scale(parameter: Parameter, longest: float, spacing: float) -> Param
         if low > 0:
             high = max(high, LASTING * longest)
         else:
-            # a delay may have either sign: both ends grow alike
+            # A delay may have either sign, so both ends are scaled by the same factor.
             times = max(1.0, SHARE * longest / high)
             low, high = times * low, times * high
     elif parameter.unit == "Hz" and spacing > 0 and 0.5 / spacing < high:
@@ -50,5 +50,5 @@ def on_time_scale(parameter: Parameter, longest: float, spacing: float) -> Param
 
 
 def is_instant(coefficient: Parameter) -> bool:
-    """Whether it is an instant on the clock of a recording's stamps."""
+    """Return whether a coefficient is a time on the clock of the recording."""
     return coefficient.name.endswith(".instant")

@@ -1,4 +1,4 @@
-"""A recorded run as a fit meets it: the scenario, the observations, and a guess of how it began."""
+"""A recorded run prepared for fitting: scenario, observations and a guess of the initial state."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from sims.recording.recording import Recording, Run
 from sims.simulated import Simulated
 
 FIRST = 8
-"""Samples at the beginning of a run from which its initial state is guessed."""
+"""Number of samples at the start of a run from which its initial state is guessed."""
 BENT = 5
-"""Samples from which a parabola is laid through them; through fewer a line."""
+"""Minimum number of samples to fit a parabola; with fewer samples a line is fitted."""
 STRAIGHT = 3
-"""Samples from which there is a slope at all: with fewer it is all noise."""
+"""Minimum number of samples to estimate a slope; with fewer samples it would be mostly noise."""
 CLEAR = 10.0
-"""Height in metres at which a ball begins whose height is not recorded, besides what its run needs
-not to land.
+"""Start height in metres of a ball without a recorded height.
+
+It is added to the height that the ball needs so that it does not land during its run.
 """
 FASTEST = 100.0
-"""Speed in m/s at which such a ball may fall all the time, as its own is not known."""
+"""Maximum assumed fall speed in m/s of a ball whose height and speed are not recorded."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +32,12 @@ class Track:
     """One recorded run.
 
     Attributes:
-        name: the run's name.
-        scenario: what the simulator is given; its initial states are guesses where they are not
-            stated.
-        observed: (T, C) SI units, NaN where missing.
-        guess: (s,) initial states, stated or guessed from the first samples.
-        known: (s,) which of them are not to be estimated: stated, or of a coordinate that is not
-            recorded.
+        name: name of the run.
+        scenario: input of the simulator.
+        observed: (T, C) observations in SI units, NaN where missing.
+        guess: (s,) initial states, specified or guessed from the first samples.
+        known: (s,) whether a state is not estimated, because it is specified or because no recorded
+            channel depends on its coordinate.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Track:
 
     @property
     def seconds(self) -> float:
-        """How long it takes."""
+        """Duration of the run in seconds."""
         times = self.scenario.times
         return float(times[-1] - times[0])
 
@@ -59,13 +59,21 @@ def tracked(
     simulator: Simulated,
     states: Sequence[str],
 ) -> Track:
-    """A run of a recording, for a simulator that observes its channels and has these states."""
+    """Prepare a run of a recording for a simulator.
+
+    Args:
+        run: the run.
+        recording: the recording that contains the run.
+        simulator: simulator that observes the recorded channels.
+        states: names of the initial states.
+    """
     columns = [run.channels[c.name] for c in simulator.channels]
-    # a run's own constants hold in it alone
+    # Constants of a run are valid only in this run.
     constants = {**recording.constants, **run.constants}
     guesses = _guessed(run, simulator)
     fixed = {*run.initial, *_hidden(simulator)}
-    # what is none of the states, as the pose of what floats, is no lane's own
+    # Initial values that are not states of the system, such as the pose of a floating base, are not
+    # part of a batch element.
     begun = {name: value for name, value in run.initial.items() if name not in states}
     return Track(
         name=run.name,
@@ -79,50 +87,57 @@ def tracked(
 
 
 def _guessed(run: Run, simulator: Simulated) -> dict[str, float]:
-    """Initial states by name: stated, else from the first samples, else their defaults."""
+    """Return initial states by name: specified, guessed from the first samples, or default."""
     system = simulator.system
     values = dict(simulator.states)
-    # not strict: behind the coordinates' rates, an own system may have other states
+    # Not strict, because a user-defined system may have states in addition to coordinates and
+    # rates.
     for coordinate, rate in zip(system.coordinates, system.rates, strict=False):
         if coordinate in run.channels:
             values[coordinate], values[rate] = beginning(run.times, run.channels[coordinate])
-    # a rate that is recorded itself is known better than by a slope
+    # A recorded rate is more accurate than a slope.
     for rate in system.rates:
         if rate in run.channels:
             values[rate] = beginning(run.times, run.channels[rate])[0]
     if system.bounces and system.coordinates[-1] not in run.channels:
         values[system.coordinates[-1]] = _aloft(run, simulator)
-    # what is stated overrules every guess
+    # Specified values override every guess.
     values.update(run.initial)
     return values
 
 
 def _aloft(run: Run, simulator: Simulated) -> float:
-    """A height in metres from which nothing lands in this run: where the height above the ground is
-    not recorded, no impact can be told.
+    """Return a start height in metres from which the ball does not land during the run.
+
+    If the height is not recorded, impacts cannot be identified.
     """
     constant = simulator.constant_values.get("gravity", 9.81)
     gravity = float(run.constants.get("gravity", constant))
     seconds = float(run.times[-1] - run.times[0])
-    # twice what gravity takes away, and what a fast throw downwards does
+    # Allow for twice the fall due to gravity and for a fast downward throw.
     return CLEAR + FASTEST * seconds + gravity * seconds**2
 
 
 def _hidden(simulator: Simulated) -> set[str]:
-    """States of coordinates that nothing recorded has to do with: taken to be at their defaults."""
+    """Return the states of coordinates that no recorded channel shows; they keep their defaults."""
     system, shown = simulator.system, {c.name for c in simulator.channels}
     hidden = set()
     pairs = zip(system.coordinates, system.rates, strict=False)
     for axis, (coordinate, rate) in enumerate(pairs):
         about = {coordinate, rate, f"accel_{coordinate}"}
-        # biases and springs act on the primary coordinate: it is never taken to be still
+        # Biases and springs act on the primary coordinate, so its states are always estimated.
         if axis != system.primary and not about & shown:
             hidden |= {coordinate, rate}
     return hidden
 
 
 def first_of(scenario: Scenario, samples: int) -> Scenario:
-    """The first samples of a scenario."""
+    """Return a scenario cut to its first samples.
+
+    Args:
+        scenario: the scenario.
+        samples: number of samples to keep.
+    """
     if samples >= scenario.times.size:
         return scenario
     inputs = {name: signal[:samples] for name, signal in scenario.inputs.items()}
@@ -131,8 +146,14 @@ def first_of(scenario: Scenario, samples: int) -> Scenario:
 
 
 def beginning(times: Array, values: Array) -> tuple[float, float]:
-    """Value and slope at the first instant, from a parabola through the first samples that are
-    there.
+    """Estimate value and slope at the first time from a parabola through the first samples.
+
+    Args:
+        times: (T,) times, s.
+        values: (T,) samples, NaN where missing.
+
+    Returns:
+        The value and the slope; 0 where there are too few samples.
     """
     seen = np.isfinite(values)
     t = times[seen][:FIRST] - times[0]
@@ -141,7 +162,7 @@ def beginning(times: Array, values: Array) -> tuple[float, float]:
         return 0.0, 0.0
     if t.size < STRAIGHT:
         return float(y[0]), 0.0
-    # powers of time between 0 and 1, whatever the sampling, are well conditioned
+    # Scaling time to [0, 1] keeps its powers well conditioned at any sample rate.
     scale = float(t[-1]) or 1.0
     degree = 1 if t.size < BENT else 2
     coefficients = np.polynomial.polynomial.polyfit(t / scale, y, degree)

@@ -1,6 +1,4 @@
-"""Lets a registered tuner find where the fit of the base model begins: the same contract as in a
-comparison.
-"""
+"""Initial base parameters from a registered tuner, run as in a comparison of tuners."""
 
 from __future__ import annotations
 
@@ -13,20 +11,27 @@ from bench.runs.standalone import Standalone, recommended
 from sims.base import Array
 
 BUDGET = 60
-"""Simulations of all runs that the tuner may use."""
+"""Maximum number of simulations of all runs by the tuner."""
 SECONDS = 300.0
-"""Time after which the tuner is stopped, seconds."""
+"""Time limit of the tuner, in seconds."""
 
 
 def tuned(name: str, world: World, noise: Noise, seed: int) -> Array:
-    """Base parameters (b,) that a tuner recommends, initial states as guessed from the first
-    samples.
+    """Run a tuner, and return the base parameters (b,) that it recommends.
+
+    Initial states are fixed at their guesses from the first samples.
+
+    Args:
+        name: name of the tuner.
+        world: the runs.
+        noise: noise of each channel.
+        seed: seed of the tuner's random numbers.
 
     Raises:
-        InputError: no such tuner, or one that must be trained first.
+        InputError: the tuner does not exist, or must be trained first.
     """
     channels = world.observed.shape[2]
-    # a tuner knows one table: the runs follow one another, all of them padded to one length
+    # A tuner accepts one table, so the runs are concatenated, all padded to the same length.
     observed = world.observed.reshape(-1, channels)
     parameters = [world.parameters[i] for i in world.base]
     problem = Standalone(
@@ -46,14 +51,23 @@ def _evaluated(
     observed: Array,
     base: Array,
 ) -> tuple[Array, Array]:
-    """Observations (n, T, C) of base parameters (n, b), and their losses (n,).
+    """Simulate base parameters, and compute their losses.
 
-    The loss is the root mean square of scaled residuals, as in a comparison; what cannot be
-    simulated is infinitely far.
+    The loss is the root mean square of scaled residuals, as in a comparison; it is infinite if the
+    simulation fails.
+
+    Args:
+        world: the runs.
+        noise: noise of each channel.
+        observed: (T, C) observations of all runs, concatenated.
+        base: (n, b) base parameters.
+
+    Returns:
+        Observations (n, T, C) and losses (n,).
     """
     count = len(base)
     runs = len(world.tracks)
-    # no effect acts: the coefficients behind the base parameters are zero
+    # No effect is active, because the coefficients after the base parameters are zero.
     theta = np.tile(world.nominal(), (count, 1))
     theta[:, world.base] = base
     simulated = world.simulate(
@@ -63,7 +77,7 @@ def _evaluated(
     ).reshape(count, -1, observed.shape[1])
 
     residuals = np.where(np.isfinite(observed), simulated - observed, 0.0)
-    # a lane that was given up is NaN, which is no news here
+    # An abandoned simulation is NaN, which is expected here.
     with np.errstate(invalid="ignore"):
         squares = np.square(residuals / noise.sigma)
         losses = np.sqrt(squares.mean(axis=(1, 2)))

@@ -1,8 +1,8 @@
-"""When the search has to end, how far it is, and what it was still to ask.
+"""Deadline, interruption and progress of a search, and the questions that it has not answered.
 
-A search ends early in one of two ways. Fits leave off after the step that they are at, and keep the
-best point so far (`Watch.leaves`); between fits the search is told by an exception. Whatever may
-have been left off is followed by a `Watch.check`, so that nothing half fitted is judged.
+A search ends early in one of two ways. A fit stops after its present step and keeps the best point
+so far (`Watch.leaves`). Between fits, an exception ends the search. `Watch.check` follows every
+computation that may have been stopped, so an incomplete fit is never evaluated.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ QUESTIONS: Mapping[str, str] = {
     "structure": "whether a force of any shape would help still",
     "alternatives": "what would explain the same as well",
 }
-"""What is asked, in this order, by its name in verdict.json."""
+"""Questions of a search in their order, by their name in verdict.json."""
 
 STAGES: Mapping[str, str] = {
     "base_fit": "fitting the base model",
@@ -36,7 +36,7 @@ STAGES: Mapping[str, str] = {
     "structure": "testing the residual for structure",
     "alternatives": "looking for alternative causes",
 }
-"""The stage that each question begins with, as the display of progress names it."""
+"""Name of the first stage of each question, as the progress display shows it."""
 
 WEIGHTS: Mapping[str, float] = {
     "base_fit": 1.5,
@@ -46,20 +46,20 @@ WEIGHTS: Mapping[str, float] = {
     "structure": 0.5,
     "alternatives": 0.5,
 }
-"""What answering each takes, in seconds of a small recording: the bar is laid out by them."""
+"""Time to answer each question, in seconds for a small recording; it scales the progress bar."""
 LARGER = 6.0
-"""The same of models with one more effect."""
+"""Time to search models with one more effect, in seconds for a small recording."""
 STEP = 0.4
-"""Share of what is left of a question that each look at it takes, as far as the bar knows."""
+"""Share of the remaining progress of a question that each step is assumed to take."""
 
 
 @dataclass(frozen=True)
 class Cut:
-    """That the search was ended early.
+    """Early end of a search.
 
     Attributes:
-        by: ``budget`` or ``interrupt``.
-        during: what was being looked at.
+        by: reason, ``budget`` or ``interrupt``.
+        during: the step that was running.
         not_asked: questions without an answer: ``base_fit``, ``search``, ``rivals``, ``held_out``,
             ``structure``, ``alternatives``.
     """
@@ -69,30 +69,31 @@ class Cut:
     not_asked: tuple[str, ...]
 
     def document(self) -> dict[str, Any]:
-        """As in verdict.json."""
+        """Return the entry of verdict.json."""
         return {"by": self.by, "during": self.during, "not_asked": list(self.not_asked)}
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Cut:
-        """From verdict.json."""
+        """Create an instance from the entry of verdict.json."""
         return cls(document["by"], document["during"], tuple(document["not_asked"]))
 
 
 class EndedError(Exception):
-    """The search has to end now."""
+    """Raised when the search has to end now."""
 
 
 class Watch:
-    """Watches over one search.
+    """Deadline and progress of one search.
 
     Attributes:
-        deadline: on the clock `time.monotonic`, the same in all processes; None without an end.
+        deadline: end of the search on the clock `time.monotonic`, which all processes share; None
+            for no limit.
 
     Args:
-        budget: seconds of the clock after which it ends; None without an end.
-        stop: asked between two steps: whether somebody wants an end.
-        progress: told the share that is done, as far as can be known, and what is looked at.
-        listener: receives the stages, steps and findings of the search.
+        budget: wall-clock time limit in seconds; None for no limit.
+        stop: callback that returns whether the user wants to stop; called between two steps.
+        progress: callback that receives the estimated finished share and the current step.
+        listener: receives the stages, steps and results of the search.
     """
 
     def __init__(
@@ -110,13 +111,18 @@ class Watch:
         self._left = False
         self._what = ""
         self._question = "base_fit"
-        # Weights of what is done, of what is at hand, and of what follows.
+        # Weights of finished questions, of the present question, and of the later ones.
         self._done, self._now = 0.0, WEIGHTS["base_fit"]
         self._ahead = _after("base_fit")
         self._looks = -1
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Report the stage that begins, and its number of steps where that is known."""
+        """Report the start of a stage.
+
+        Args:
+            name: description of the stage.
+            total: number of steps of the stage; None if unknown.
+        """
         self._listener.stage(name, total)
 
     def advance(self, count: int = 1) -> None:
@@ -124,11 +130,16 @@ class Watch:
         self._listener.advance(count)
 
     def found(self, effects: Sequence[str], share: float) -> None:
-        """Report the best model so far and the share of the gap that it closes."""
+        """Report the best model so far.
+
+        Args:
+            effects: names of its effects.
+            share: share of the discrepancy that the model removes, 0 to 1.
+        """
         self._listener.found(effects, share)
 
     def over(self) -> bool:
-        """Whether the search has to end; once it has, it does."""
+        """Return whether the search has to end; once true, it stays true."""
         if self._by is None and self._stop():
             self._by = "interrupt"
         if self._by is None and self.deadline is not None and time.monotonic() >= self.deadline:
@@ -136,10 +147,10 @@ class Watch:
         return self._by is not None
 
     def begin(self, question: str) -> None:
-        """Go on to a question of `QUESTIONS`.
+        """Begin a question of `QUESTIONS`.
 
         Raises:
-            EndedError: there is no time for it.
+            EndedError: the search has to end.
         """
         self._enter(WEIGHTS[question])
         self._question = question
@@ -148,57 +159,62 @@ class Watch:
         self.look(QUESTIONS[question])
 
     def grow(self) -> None:
-        """Go on to larger models, which nobody could foresee."""
+        """Begin the search of larger models, whose number cannot be predicted."""
         self._enter(LARGER)
 
     def _enter(self, weight: float) -> None:
+        """Move the progress to a part of the search with the given weight."""
         self._done += self._now
         self._now = weight
         self._looks = -1
 
     def look(self, what: str) -> None:
-        """Tell what is looked at next.
+        """Report the next step, and check that the search may continue.
 
         Raises:
-            EndedError: there is no time for it.
+            EndedError: the search has to end.
         """
         self.check()
         self.tell(what)
 
     def tell(self, what: str) -> None:
-        """Tell what is looked at next, where fits leave off by themselves."""
+        """Report the next step without a check, where fits stop by themselves."""
         self._what = what
         self._looks += 1
         self._advance(0.0)
 
     def check(self) -> None:
-        """See whether what was just done was done to its end.
+        """Raise an error if the last computation may have been stopped early.
 
         Raises:
-            EndedError: it may have been left off.
+            EndedError: the search has to end.
         """
         if self.over():
             raise EndedError
 
     def leaves(self, share: float) -> bool:
-        """Whether a fit has to leave off, of which this share is done."""
+        """Return whether a fit has to stop now.
+
+        Args:
+            share: share of the fit that is finished, 0 to 1.
+        """
         self._advance(share)
         self._left |= self.over()
         return self._left
 
     def left_off(self, left: bool) -> None:
-        """Take into account that a fit was left off in another process."""
+        """Record whether a fit was stopped in another process."""
         self._left |= left
 
     def left(self) -> bool:
-        """Whether any fit was left off."""
+        """Return whether any fit was stopped early."""
         return self._left
 
     def cut(self, held_out: bool) -> Cut:
-        """What was not asked any more.
+        """Return the reason of the early end and the questions that were skipped.
 
         Args:
-            held_out: whether there are held-out runs to ask.
+            held_out: whether there are held-out runs.
         """
         names = list(QUESTIONS)
         open_ones = names[names.index(self._question) :]
@@ -207,8 +223,13 @@ class Watch:
         return Cut(self._by or "interrupt", self._what, tuple(open_ones))
 
     def _advance(self, share: float) -> None:
+        """Report the finished share of the search.
+
+        Args:
+            share: finished share of the present fit, 0 to 1.
+        """
         remaining = (1.0 - STEP) ** self._looks
-        # Looks before this one have taken their shares; a fit is a part of this one's.
+        # Earlier steps have taken their shares; the fit is a part of the present step.
         within = 1.0 - remaining * (1.0 - STEP * share)
         total = self._done + self._now + self._ahead
         done = (self._done + self._now * within) / total
@@ -218,6 +239,6 @@ class Watch:
 
 
 def _after(question: str) -> float:
-    """Weights of the questions behind one."""
+    """Return the total weight of the questions after the given one."""
     names = list(QUESTIONS)
     return sum(WEIGHTS[name] for name in names[names.index(question) + 1 :])

@@ -1,8 +1,8 @@
 """Wider ranges for base parameters that a fit leaves at a bound of their range.
 
-A declared range is a guess of what is usual. Where the best value lies beyond it, the base model is
-wrong, and an effect of the library would be fitted to the difference. So the range is widened as
-far as physics allows, and the base model is fitted again.
+A declared range is a guess of usual values. If the best value lies outside it, the base model is
+wrong, and an effect of the library would be fitted to the difference. Therefore the range is
+widened as far as physics allows, and the base model is fitted again.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from sims.base import Array, Parameter
 Bounds = tuple[float, float]
 
 FACTOR = 4.0
-"""A range becomes this many times as wide in one round."""
+"""Factor by which a range is widened in one round."""
 ROUNDS = 5
 """Maximum number of rounds: the range is then a thousand times as wide."""
 
 
 def at_bounds(world: World, base: Base) -> list[int]:
-    """Places of fitted base parameters that lie at a bound beyond which physics allows values."""
+    """Return the indices of fitted base parameters at a bound that physics allows to exceed."""
     places = []
     for i in world.base.tolist():
         if i in base.frozen:
@@ -47,11 +47,11 @@ def fit_wider(world: World, noise: Noise, base: Base) -> tuple[Base, dict[str, B
 
     Args:
         world: the runs for fitting; the ranges of its parameters are replaced.
-        noise: of each channel.
+        noise: noise of each channel.
         base: the fitted base model.
 
     Returns:
-        The base model, and the new ranges by name; empty where nothing lies at a bound.
+        The base model, and the new ranges by name; empty if no parameter is at a bound.
     """
     found: dict[str, Bounds] = {}
     for _ in range(ROUNDS):
@@ -68,12 +68,14 @@ def fit_wider(world: World, noise: Noise, base: Base) -> tuple[Base, dict[str, B
 
 
 def range_around(world: World, place: int, value: float | None = None) -> Bounds:
-    """The range of a base parameter, widened until it contains a value or ROUNDS times.
+    """Return the range of a base parameter, widened until it contains a value.
+
+    It is widened at most `ROUNDS` times.
 
     Args:
         world: the runs for fitting.
-        place: of the parameter.
-        value: which the range must contain; None for the widest range.
+        place: index of the parameter.
+        value: value that the range must contain; None for the widest range.
     """
     parameter = world.parameters[place]
     limits = limits_of(world, place)
@@ -86,19 +88,29 @@ def range_around(world: World, place: int, value: float | None = None) -> Bounds
 
 
 def use_bounds(world: World, found: Mapping[str, Bounds]) -> None:
-    """Let the parameters of a world have these ranges."""
+    """Replace the ranges of parameters of a world.
+
+    Args:
+        world: the runs for fitting; its parameters are replaced.
+        found: new range of each parameter, by name.
+    """
     if not found:
         return
     world.parameters = tuple(
         replace(p, bounds=found[p.name], training=None) if p.name in found else p
         for p in world.parameters
     )
-    # Processes that were forked before have the narrow ranges.
+    # Workers that were forked before still have the narrow ranges.
     world.crew.forget(world)
 
 
 def limits_of(world: World, place: int) -> Bounds:
-    """What is physically possible of a base parameter: for a robot, what its total allows."""
+    """Return the physical limits of a base parameter; for a robot, those of its total value.
+
+    Args:
+        world: the runs for fitting.
+        place: index of the parameter.
+    """
     parameter = world.parameters[place]
     if world.kind.has_model:
         coefficient = _coefficient(world.kind, parameter.name)
@@ -112,7 +124,7 @@ def limits_of(world: World, place: int) -> Bounds:
 
 
 def _coefficient(kind: Any, name: str) -> Any:
-    """The coefficient of a robot's effect that a freed parameter is; None of any other."""
+    """Return the effect coefficient of a robot that a freed parameter stands for, or None."""
     for effect in kind.system.freed_effects:
         for c in effect.coefficients:
             if name in (effect.name, f"{effect.name}.{c.name}"):
@@ -121,8 +133,9 @@ def _coefficient(kind: Any, name: str) -> Any:
 
 
 def _limits(parameter: Parameter) -> Bounds:
-    """What is possible of a declared parameter by its unit and its range: what is never negative
-    stays so, and a share is at most 1.
+    """Return the limits of a declared parameter from its unit and its range.
+
+    A parameter with a nonnegative range stays nonnegative, and a share is at most 1.
     """
     low, high = parameter.bounds
     share = parameter.unit == "1" and low >= 0.0 and high <= 1.0
@@ -130,22 +143,27 @@ def _limits(parameter: Parameter) -> Bounds:
 
 
 def widened(parameter: Parameter, limits: Bounds) -> Bounds:
-    """The next wider range of a parameter within its physical limits."""
+    """Return the next wider range of a parameter.
+
+    Args:
+        parameter: the parameter with its present range.
+        limits: its physical limits.
+    """
     low, high = parameter.bounds
     width = high - low
-    # What is positive stays positive: its range grows by a factor to either side.
+    # A positive parameter stays positive, so its range grows by a factor on both sides.
     lower = low / FACTOR if low > 0.0 else low - (FACTOR - 1.0) * width * (low < 0.0)
     upper = high * FACTOR if low >= 0.0 else high + (FACTOR - 1.0) * width
     return max(lower, min(limits[0], low)), min(upper, max(limits[1], high))
 
 
 def outside(world: World, theta: Array, wider: Mapping[str, tuple[Bounds, Bounds]]) -> list[str]:
-    """A sentence for each parameter of a fitted model that lies outside its declared range.
+    """Return a sentence for each fitted parameter that lies outside its declared range.
 
     Args:
         world: the runs for fitting.
         theta: (P,) the fitted parameters.
-        wider: by name of a parameter, its declared range and the wider one that it was given.
+        wider: by parameter name, the declared range and the wider range that was used.
     """
     sentences = []
     for i in world.base.tolist():

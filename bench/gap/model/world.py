@@ -1,6 +1,4 @@
-"""The recorded runs as the simulator meets them: any parameters, effects and initial states, many
-lanes in one call.
-"""
+"""Simulate recorded runs with any parameters, effects and initial states, as one large batch."""
 
 from __future__ import annotations
 
@@ -28,87 +26,97 @@ from sims.system import Effect, Input, Sensor, members_of
 Indices = NDArray[np.intp]
 
 LANE_SAMPLES = 400_000
-"""Samples simulated in one call of the engine: beyond it more lanes cost memory and gain nothing.
+"""Maximum number of samples simulated in one engine call.
+
+Larger calls need more memory and are not faster.
 """
 LEAST_LANES = 64
-"""But so many lanes go together however long they are: the engine steps them side by side."""
+"""Minimum batch size of an engine call, however long the runs; the engine steps it in parallel."""
 PIECE = 80_000
-"""The same where calls of compiled steps are pieces for several cores."""
+"""Maximum number of samples per chunk if compiled steps are distributed over several cores."""
 FEWEST_LANES = 32
-"""But so many lanes make a piece."""
+"""Minimum number of batch elements per chunk if work is distributed over several cores."""
 TIME_STEP = 0.01
-"""Longest step of the batch engine, seconds; it shortens its steps itself where motion or forces
-ask for it.
+"""Maximum time step of the batch engine, in seconds.
+
+The engine uses shorter steps where the motion or the forces require it.
 """
 FINE_STEP = 0.0025
-"""The same where a sensor filters: a filter takes what it reads for linear over each step, which an
-impact is not.
+"""Maximum time step of the batch engine, in seconds, if a sensor filters its signal.
+
+A filter treats its input as linear over each step, which an impact is not.
 """
 TURN = 0.14
-"""Radians of an oscillation in a step of the batch engine: its phase is then off by 3e-6 of itself.
-"""
+"""Maximum phase of an oscillation per step of the batch engine, in radians; relative error 3e-6."""
 PATIENCE = 4.0
-"""A lane is given up that needs so many times the planned steps: all lanes of a call wait for the
-slowest one.
+"""Maximum ratio of actual to planned steps before a batch element is abandoned.
+
+All elements of a call wait for the slowest one.
 """
 FREED = 5.0
-"""A constant that is set free is searched from a fifth of its value to five times it."""
+"""Range factor of a constant that is estimated: from value / 5 to value * 5."""
 
 
 class World:
-    """Some runs of a recording, and one simulator that has every effect at hand, off unless its
-    coefficients say so.
+    """Simulates the runs of a recording for given parameters, effects and initial states.
 
-    A vector theta (P,) holds the system's own parameters, constants set free, then all
-    coefficients. A model is thus a sparse vector, and models, runs and finite differences share one
-    call of the engine as lanes of it.
+    The simulator contains every available effect; an effect is off unless its coefficients are
+    nonzero. A vector theta (P,) holds the base parameters of the system, the constants to estimate,
+    and then the coefficients of all effects. A model is therefore a sparse vector, and models, runs
+    and finite differences are simulated together as elements of one batch.
 
     Attributes:
-        kind, recording, runs, engine, extra: as given.
-        library: names of the effects at hand, without the extra ones.
-        simulator: has them all; its channels are those recorded.
-        own: number of the system's own parameters.
+        kind: class of the simulator, as given.
+        recording: the recording, as given.
+        runs: its runs that are used, as given.
+        engine: name of the engine, as given.
+        extra: effects in addition to the library, as given.
+        library: names of the available effects, without the extra ones.
+        simulator: simulator with all available effects; its channels are the recorded ones.
+        own: number of base parameters of the system.
         freed: constants that are treated as parameters.
-        parameters: (P,) what stands in theta.
-        base: (b,) places of the own parameters and the freed constants.
-        slots: places of each effect's coefficients.
+        parameters: (P,) description of each element of theta.
+        base: (b,) indices in theta of the base parameters and the estimated constants.
+        slots: slice of theta with the coefficients of each effect.
         states: names of the initial states.
-        tracks: the runs.
-        lengths: (R,) their numbers of samples.
-        observed: (R, T, C) SI units; NaN where missing, or behind the end of a run.
-        known: (R, s) initial states that are not to be estimated.
-        guess: (R, s) initial states, stated or guessed.
-        longest: duration of the longest run, seconds.
-        clock: the first and the last stamp of all runs, seconds.
-        simulations: lanes simulated so far.
-        watch: says when fits have to leave off; never, unless another is put here.
-        correction: (R, T, C) what is added to all that is simulated, if anything is
+        tracks: the runs, prepared for fitting.
+        lengths: (R,) number of samples of each run.
+        observed: (R, T, C) observations in SI units; NaN where missing, or after the end of a run.
+        known: (R, s) whether an initial state is known, and so is not estimated.
+        guess: (R, s) initial states, specified or guessed.
+        longest: duration of the longest run, in seconds.
+        clock: first and last time stamp of all runs, in seconds.
+        simulations: number of batch elements simulated so far.
+        watch: search control that stops fits early; by default it never does.
+        correction: (R, T, C) correction added to all simulations, or None
             (`bench.gap.model.tangents`).
-        derivatives: (R, T, C, s) by initial states, where they have been taken from a tangent.
-        neighbourhoods: of runs of a robot, that were asked for last (`bench.gap.model.tangents`).
-        simulated: what effects without a tangent change about them, by name and coefficients.
-        followed: the runs of a robot as a filter follows them, if it does
+        derivatives: (R, T, C, s) derivatives by the initial states if they come from a
+            linearisation, else None.
+        neighbourhoods: linearised robot runs that were used most recently
+            (`bench.gap.model.tangents`).
+        simulated: responses to effects that have no linearisation, by name and coefficients.
+        followed: the runs of a robot as followed by a state filter, or None
             (`bench.gap.prediction_error.candidate_responses`).
-        identified: (b,) base parameters of a robot that prediction errors identify; None where they
-            identify none.
-        state_prior: (s,) standard deviations of initial states about their guesses, where a filter
-            follows a robot's runs.
-        measured: of runs of a robot, states from readings alone
+        identified: (b,) base parameters of a robot identified by prediction errors; None if there
+            are none.
+        state_prior: (s,) standard deviations of the initial states about their guesses, if a filter
+            follows the runs of a robot; else None.
+        measured: for runs of a robot, states estimated from readings alone
             (`bench.gap.prediction_error.measured_states`).
-        crew: who simulates and fits; this process alone, unless another is put here.
+        crew: worker pool for simulations and fits; by default only this process.
 
     Args:
-        kind: the simulator's class.
-        recording: what was recorded.
-        runs: which of its runs; all have the same length of padding afterwards.
-        engine: the engine's name.
-        extra: effects beside the registered library.
-        free: constants to treat as parameters.
-        candidates: names of the library's effects to have at hand; None for all that fit.
+        kind: class of the simulator.
+        recording: the recording.
+        runs: the runs of the recording to use; they are padded to equal length.
+        engine: name of the engine.
+        extra: effects in addition to the registered library.
+        free: names of constants to treat as parameters.
+        candidates: names of the available library effects; None for all that are applicable.
 
     Raises:
-        InputError: the simulator is no system that takes effects, a constant does not exist, or no
-            channel is its own.
+        InputError: the simulator is not a system that accepts effects, a constant does not exist,
+            or none of its channels is recorded.
     """
 
     def __init__(
@@ -128,7 +136,7 @@ class World:
         self.extra = tuple(extra)
         usable = library.library(kind.system)
         recorded = {*self.runs[0].channels, *(c.name for c in kind.inputs)}
-        # an effect on a channel that nobody recorded shows nowhere
+        # An effect on a channel that is not recorded is not observable.
         shown = [
             name
             for name, effect in usable.items()
@@ -138,7 +146,7 @@ class World:
         self.library = shown if candidates is None else list(candidates)
         self.simulator, self._fine = self._simulators()
 
-        # theta in its three parts: own parameters, freed constants, coefficients
+        # Theta has three parts: base parameters, freed constants, coefficients.
         system = self.simulator.system
         self.own = len(system.parameters)
         self.freed = [_freed(name, self.simulator, recording) for name in free]
@@ -148,7 +156,7 @@ class World:
         self.slots = _slots(self.simulator, self.base.size)
         self._shifting, self._filtering = self._delaying()
 
-        # the runs; a system without coordinates names its states itself
+        # A system without coordinates provides the names of its states itself.
         self.states = [*system.coordinates, *system.rates] or list(kind.states)
         self.tracks: tuple[Track, ...] = tuple(
             tracked(run, recording, self.simulator, self.states) for run in runs
@@ -176,16 +184,16 @@ class World:
         self._parts: dict[float, list[Scenario]] = {}
 
     def _simulators(self) -> tuple[Simulated, Simulated]:
-        """The simulator with all effects, and the same with the steps that a filter needs."""
+        """Create the simulator with all effects, and a copy with the fine step for filters."""
         kind = self.kind
         effects: list[str | type[Effect]] = list(self.library)
         effects += [effect for effect in self.extra if effect.fits(kind.system)]
-        # in the simulator's order, whatever that of the table's columns
+        # Channels follow the order of the simulator, not that of the columns of the log.
         recorded = self.runs[0].channels
         observe = [c.name for c in kind.channels if c.name in recorded]
         usual: dict[str, Any] = {}
         fine: dict[str, Any] = {}
-        # the other engines have steps of their own
+        # The other engines choose their steps themselves.
         if self.engine == "batch":
             usual = {"time_step": TIME_STEP, "turn": TURN, "patience": PATIENCE}
             fine = {**usual, "time_step": FINE_STEP}
@@ -197,7 +205,7 @@ class World:
         return made(usual), made(fine)
 
     def _padded(self) -> Array:
-        """(R, T, C) the observations of all runs, NaN behind the end of a shorter one."""
+        """Return the observations (R, T, C) of all runs, NaN after the end of a shorter run."""
         shape = len(self.tracks), self.lengths.max(), len(self.channels)
         observed = np.full(shape, np.nan)
         for row, track in zip(observed, self.tracks, strict=True):
@@ -205,36 +213,38 @@ class World:
         return observed
 
     def _longest(self) -> float:
-        """Seconds that the longest run takes."""
-        # not zero: lengths of time are divided by it
+        """Return the duration of the longest run, in seconds."""
+        # A duration of zero is replaced, because times are divided by it.
         return max(track.seconds for track in self.tracks) or 1.0
 
     def _clock(self) -> tuple[float, float]:
-        """The first and the last stamp."""
+        """Return the first and the last time stamp of all runs."""
         stamps = [track.scenario.times for track in self.tracks]
         return min(float(t[0]) for t in stamps), max(float(t[-1]) for t in stamps)
 
     @property
     def spacing(self) -> float:
-        """Seconds from sample to sample, of the run that is sampled most often."""
+        """Median sample interval of the run sampled most often, in seconds; 0 if unknown."""
         gaps = [np.diff(track.scenario.times) for track in self.tracks]
         return min((float(np.median(gap)) for gap in gaps if gap.size), default=0.0)
 
     @property
     def travel(self) -> float:
-        """The largest range of the primary coordinate in one run; 0 where it is not recorded."""
+        """Largest range of the primary coordinate within one run; 0 if it is not recorded."""
         system = self.simulator.system
         return self._range(system.coordinates[system.primary] if system.coordinates else "")
 
     def travel_of(self, effect: str) -> float:
-        """The range of the coordinate that an effect acts on, in the run where it is largest; 0
-        where it is not recorded.
+        """Return the largest range within one run of the coordinate that an effect acts on.
+
+        The range is 0 if the coordinate is not recorded.
         """
         return self._range(self._coordinate(effect))
 
     def ends_of(self, effect: str) -> tuple[float, float]:
-        """The lowest and the highest value of the same over all runs; both 0 where it is not
-        recorded.
+        """Return the minimum and maximum, over all runs, of the coordinate that an effect acts on.
+
+        Both are 0 if the coordinate is not recorded.
         """
         name = self._coordinate(effect)
         if name not in self.channels:
@@ -243,14 +253,14 @@ class World:
         return float(np.nanmin(values, initial=np.inf)), float(np.nanmax(values, initial=-np.inf))
 
     def _coordinate(self, effect: str) -> str:
-        """The coordinate that an effect acts on; none in an own simulator that has none."""
+        """Return the coordinate that an effect acts on; empty if there are no coordinates."""
         system = self.simulator.system
         coordinate = self.effects[effect].coordinate
         place = system.primary if coordinate is None else coordinate
         return system.coordinates[place] if system.coordinates else ""
 
     def _range(self, name: str) -> float:
-        """The largest range of a channel in one run, found once; 0 where it is not recorded."""
+        """Return the largest range of a channel within one run, cached; 0 if not recorded."""
         if name not in self._travels:
             self._travels[name] = self._travel(name)
         return self._travels[name]
@@ -259,14 +269,19 @@ class World:
         if name not in self.channels:
             return 0.0
         values = self.observed[:, :, self.channels.index(name)]
-        # A run without a sample of the channel has no range.
+        # A run without samples of the channel has no range.
         values = values[np.isfinite(values).any(axis=1)]
         ranges = np.nanmax(values, axis=1) - np.nanmin(values, axis=1)
         return float(ranges.max(initial=0.0))
 
     def _delaying(self) -> tuple[Indices, Indices]:
-        """Where coefficients stand that move instants, and that need every step: such lanes are
-        simulated apart.
+        """Return the indices of coefficients that shift sample times or need fine steps.
+
+        Batch elements with such coefficients are simulated separately.
+
+        Returns:
+            The indices in theta of coefficients that shift sample times, and of those that need
+            fine steps.
         """
         shifting: list[int] = []
         filtering: list[int] = []
@@ -276,13 +291,11 @@ class World:
                 shifting.extend(places)
             if effect.sharp or (isinstance(effect, Sensor) and effect.filters):
                 filtering.extend(places)
-        # the type matters where there is none: places of an empty list would be floats
+        # The type must be given, because an empty list would become an array of floats.
         return np.array(shifting, dtype=np.intp), np.array(filtering, dtype=np.intp)
 
     def _on_time_scale(self) -> tuple[Parameter, ...]:
-        """The parameters, with coefficients whose ranges suit the duration and the sampling of the
-        runs.
-        """
+        """Return the parameters with coefficient ranges for the time scale of the runs."""
         first, spacing = self.base.size, self.spacing
         coefficients = self.parameters[first:]
         scaled = [on_time_scale(p, self.longest, spacing) for p in coefficients]
@@ -290,33 +303,33 @@ class World:
 
     @property
     def channels(self) -> list[str]:
-        """Names of the recorded channels, in the order of observations."""
+        """Names of the recorded channels, in the order of the observations."""
         return [c.name for c in self.simulator.channels]
 
     @cached_property
     def effects(self) -> dict[str, Effect]:
-        """Every effect at hand, by name."""
+        """Available effects by name."""
         return {effect.name: effect for effect in self.simulator.effects}
 
     @property
     def linear(self) -> bool:
-        """Whether the simulator tells what small changes do, without simulating each of them."""
+        """Whether the simulator provides linearised responses to small changes."""
         return self.kind.has_model
 
     def places(self, effect: str) -> range:
-        """Where an effect's coefficients stand in theta."""
+        """Return the indices in theta of the coefficients of an effect."""
         slot = self.slots[effect]
         return range(slot.start, slot.stop)
 
     def nominal(self) -> Array:
-        """(P,) parameters at their nominal values, every effect off."""
+        """Return the parameters (P,) at their nominal values, with all effects off."""
         values = np.array([p.nominal for p in self.parameters])
-        # a coefficient of zero is an effect that does not act, whatever its nominal size
+        # An effect is off if its coefficients are zero, whatever their nominal values.
         values[self.base.size :] = 0.0
         return values
 
     def counted(self, share: float) -> Mask:
-        """(R, T, C) the samples that are there in the first share of each run."""
+        """Return the mask (R, T, C) of available samples within the first share of each run."""
         numbers = np.arange(self.observed.shape[1])
         ends = np.ceil(share * self.lengths)
         first = numbers < ends[:, None]
@@ -330,14 +343,17 @@ class World:
         states: Array,
         share: float = 1.0,
     ) -> Array:
-        """Observations (L, T, C) of lanes.
+        """Simulate a batch of runs.
 
         Args:
             theta: (L, P) parameters.
-            runs: (L,) which runs they are in.
+            runs: (L,) index of the run of each batch element.
             states: (L, s) initial states.
-            share: only this first share of each run is simulated; what is behind it, or behind the
-                end of a shorter run, is NaN.
+            share: initial share of each run that is simulated.
+
+        Returns:
+            Observations (L, T, C); NaN after the simulated share and after the end of a shorter
+            run.
         """
         result = np.empty((len(theta), *self.observed.shape[1:]))
         if self.linear:
@@ -350,22 +366,23 @@ class World:
             made = self._simulate(theta[new], runs[new], states[new], share)
             self._cache.fill(keys, new, made, result)
         else:
-            # The slowest lane of a call sets the steps of all: in another call a lane differs in
-            # its last digits.
+            # Results are not cached here: the slowest element of a call sets the steps of all
+            # elements, so an element differs in its last digits from call to call.
             result = self._simulate(theta, runs, states, share)
         if self.correction is not None:
             result += self.correction[runs]
         return result
 
     def _simulate(self, theta: Array, runs: Indices, states: Array, share: float) -> Array:
-        """Simulate lanes, uncorrected; arguments and result as those of `simulate`."""
+        """Simulate a batch without correction; arguments and result as in `simulate`."""
         self.simulations += len(theta)
         _, length, channels = self.observed.shape
         result = np.empty((len(theta), length, channels))
         if not len(theta):
             return result
 
-        # the slowest lane of a call sets its steps: those that need many do not go with the others
+        # The slowest element of a call sets its steps, so elements that need many steps are
+        # simulated separately.
         kinds = self.kinds(theta)
         together = max(LEAST_LANES, LANE_SAMPLES // length)
         if self.apart:
@@ -383,8 +400,10 @@ class World:
         return result
 
     def over(self, runs: Sequence[Run]) -> World:
-        """A world of other runs, cut or thinned from these: with the same parameters, the same
-        grids of shapes, the same watch and crew.
+        """Return a `World` of other runs that were cut or thinned from these runs.
+
+        It shares the parameters, the grids of shape parameters, the search control and the worker
+        pool.
         """
         other = World(
             self.kind,
@@ -395,11 +414,12 @@ class World:
             free=[p.name for p in self.freed],
             candidates=self.library,
         )
-        # what is periodic goes on from piece to piece, and what is found in one is found in all
+        # Periodic effects continue from segment to segment, and a value found in one segment holds
+        # in all of them.
         other.longest = self.longest
         other.parameters = self.parameters
         other.clock = self.clock
-        # found now: of pieces it would be another
+        # Ranges are computed now, because those of segments would differ.
         for name in self.channels:
             self._range(name)
         other._travels = self._travels
@@ -408,9 +428,7 @@ class World:
         return other
 
     def with_kind(self, kind: type[Simulated]) -> World:
-        """Return a world of the same runs and parameters with another simulator of the same
-        system.
-        """
+        """Return a `World` with the same runs and another simulator of the same system."""
         other = World(
             kind,
             self.recording,
@@ -434,7 +452,11 @@ class World:
         return kind(self.recording.constants, self.channels, effects=effects)
 
     def kinds(self, theta: Array) -> Indices:
-        """(L,) which lanes of parameters (L, P) can be simulated together: those of one number."""
+        """Return group numbers (L,); batch elements of one group can share an engine call.
+
+        Args:
+            theta: (L, P) parameters.
+        """
         active = theta != 0
         shifting = active[:, self._shifting].any(axis=1)
         filtering = active[:, self._filtering].any(axis=1)
@@ -443,53 +465,65 @@ class World:
 
     @cached_property
     def apart(self) -> bool:
-        """Whether lanes cost as much in several calls as in one: where steps are compiled."""
+        """Whether splitting a batch into several calls costs no time, as with compiled steps."""
         if self.kind.has_model:
             return True
         if self.engine != "batch":
             return False
-        # loaded when something is simulated: the compiler's package is not for free
+        # Loaded only when needed, because importing the compiler package takes time.
         from sims.engines.compiled import machine
 
         return machine.machine() is not None
 
     def _scenarios(self, theta: Array, runs: Indices, share: float) -> list[Scenario]:
-        """The first share of each lane's run, with the constants that its parameters (L, P) set."""
+        """Return the scenarios of batch elements with their freed constants.
+
+        Args:
+            theta: (L, P) parameters, which contain the constants.
+            runs: (L,) index of the run of each batch element.
+            share: initial share of each run to which its scenario is cut.
+        """
         if share not in self._parts:
             self._parts[share] = [
                 first_of(t.scenario, int(np.ceil(share * len(t.observed)))) for t in self.tracks
             ]
-        # lanes of one run share its scenario, which the simulator then prepares once
+        # Elements of one run share its scenario object, so the simulator prepares it only once.
         scenarios = [self._parts[share][run] for run in runs]
         return [self._freed_in(one, own) for one, own in zip(scenarios, theta, strict=True)]
 
     def together(
         self, fine: bool, theta: Array, runs: Indices, states: Array, share: float
     ) -> Array:
-        """Observations (L, T', C) of lanes of one kind, in one call of the engine.
+        """Simulate batch elements of one group in one engine call.
 
         Args:
-            fine: in the steps that a filter needs.
-            theta: (L, P) as in `simulate`, and so the others.
-            runs: (L,).
-            states: (L, s).
-            share: of each run.
+            fine: whether to use the fine time step that filters need.
+            theta: (L, P) parameters.
+            runs: (L,) index of the run of each batch element.
+            states: (L, s) initial states.
+            share: initial share of each run that is simulated.
+
+        Returns:
+            Observations (L, T', C).
         """
         simulator = self._fine if fine else self.simulator
         scenarios = self._scenarios(theta, runs, share)
-        # to the simulator a freed constant is none of its parameters
+        # The simulator does not treat freed constants as parameters.
         freed = np.arange(self.own, self.base.size)
         lanes = np.delete(theta, freed, axis=1)
         initial = dict(zip(self.states, states.T, strict=True))
         return simulator.simulate_lanes(lanes, scenarios, initial)
 
     def elsewhere(self, theta: Array, scenarios: Sequence[Scenario], states: Array) -> Array:
-        """Observations (L, T, C) of lanes in any scenarios, NaN behind the end of a shorter one.
+        """Simulate batch elements in arbitrary scenarios.
 
         Args:
-            theta: (L, P).
-            scenarios: (L,).
-            states: (L, s).
+            theta: (L, P) parameters.
+            scenarios: (L,) scenarios.
+            states: (L, s) initial states.
+
+        Returns:
+            Observations (L, T, C), NaN after the end of a shorter scenario.
         """
         self.simulations += len(theta)
         length = max(scenario.times.size for scenario in scenarios)
@@ -508,7 +542,7 @@ class World:
         return result
 
     def _freed_in(self, scenario: Scenario, theta: Array) -> Scenario:
-        """A scenario with the constants that parameters (P,) set."""
+        """Return a scenario with the freed constants set from parameters (P,)."""
         if not self.freed:
             return scenario
         values = theta[self.own : self.base.size].tolist()
@@ -516,7 +550,14 @@ class World:
         return replace(scenario, constants={**scenario.constants, **freed})
 
     def watching(self, observe: Sequence[str], effects: Sequence[str]) -> Simulated:
-        """A simulator of the same with other channels, and with these effects alone; close it."""
+        """Return a simulator with other channels and only the given effects.
+
+        The caller must close it.
+
+        Args:
+            observe: names of the channels.
+            effects: names of the effects.
+        """
         own: list[str | type[Effect]] = [
             next((e for e in self.extra if e.name == name), name) for name in effects
         ]
@@ -527,11 +568,14 @@ class World:
         return self.kind(constants, list(observe), engine=self.engine, effects=own, **settings)
 
     def follow(self, followed: Any) -> None:
-        """Take the runs of a robot as a filter follows them: where they begin, and what their first
-        states change.
+        """Use the results of a state filter for the runs of a robot.
+
+        The filter provides guesses, derivatives and prior standard deviations of the initial
+        states.
 
         Args:
-            followed: `bench.gap.prediction_error.candidate_responses.FollowedRuns`.
+            followed: filtered runs, a
+                `bench.gap.prediction_error.candidate_responses.FollowedRuns`.
         """
         self.followed = followed
         begun = followed.first_states()
@@ -541,43 +585,53 @@ class World:
         self.state_prior = followed.state_prior()
 
     def close(self) -> None:
-        """Give back what the engine holds."""
+        """Release the resources of the engine."""
         self.simulator.close()
         self._fine.close()
 
 
 def _shows(effect: type[Effect], recorded: set[str]) -> bool:
-    """Whether the signals that an effect acts on are there; all of them, if it is a family."""
+    """Return whether all signals that an effect (or effect family) acts on are recorded."""
     members = members_of(effect)
     return all(not member.signal or member.signal in recorded for member in members)
 
 
 def _simulated(world: World, *call: Any) -> Array:
-    """A call of the engine, whoever makes it."""
+    """Simulate one engine call; a module-level function, so that workers can run it."""
     return world.together(*call)
 
 
 def _freed(name: str, simulator: Simulated, recording: Recording) -> Parameter:
-    """A constant as a parameter."""
+    """Return a constant as a parameter.
+
+    Args:
+        name: name of the constant.
+        simulator: simulator that has the constant.
+        recording: recording whose runs must not set the constant individually.
+
+    Raises:
+        InputError: the constant does not exist, is zero, or differs between runs.
+    """
     constants = {c.name: c for c in simulator.constants}
     if name not in constants:
         raise unknown(f"constant of system {simulator.name}", name, list(constants) or ["none"])
     value = simulator.constant_values[name]
-    # its range is a multiple of its value, and a run's own value would overrule what is fitted
+    # The range is a multiple of the value, and a value set by a run would override the fitted
+    # value.
     if value == 0 or any(name in run.constants for run in recording.runs):
         raise InputError(
             f"free constant {name}: expected one that is not zero and the same in every run"
         )
-    # sorted, as a constant may be negative
+    # Sorted, because a constant may be negative.
     low, high = sorted((value / FREED, value * FREED))
     constant = constants[name]
     return Parameter(name, constant.unit, value, (low, high), says=constant.says)
 
 
 def _slots(simulator: Simulated, first: int) -> dict[str, slice]:
-    """Where each effect's coefficients stand, from the first place on."""
+    """Return the slice of theta of each effect, starting at index `first`."""
     slots = {}
-    # in the simulator's order, which is that of its parameters
+    # Use the order of the simulator, which is the order of its parameters.
     for effect in simulator.effects:
         last = first + len(effect.on(simulator.system))
         slots[effect.name] = slice(first, last)
@@ -586,7 +640,7 @@ def _slots(simulator: Simulated, first: int) -> dict[str, slice]:
 
 
 def _moves_instants(effect: Effect) -> bool:
-    """Whether an effect reads signals at other instants than the scenario's."""
+    """Return whether an effect reads signals at other times than those of the scenario."""
     for family in (Input, Sensor):
         if isinstance(effect, family) and type(effect).times is not family.times:
             return True

@@ -44,42 +44,44 @@ from sims.robot.simulator import RobotSimulator
 from sims.system import Effect
 
 POSITION_PRIOR, VELOCITY_PRIOR = 1.0, 0.3
-"""Standard deviations of the first states about the measured motion: of positions in rad or m,
-since an encoder may be off, of velocities as a share of the largest one.
+"""Standard deviations of the first states about the measured motion.
+
+That of positions is in rad or m, because an encoder may have an offset; that of velocities is a
+share of the largest velocity.
 """
 LEAST_PRIOR = 1e-4
-"""The smallest one of a velocity, rad/s or m/s."""
+"""Minimum prior standard deviation of a velocity, rad/s or m/s."""
 LARGEST_PRIOR = 1e3
-"""The largest one of a velocity, rad/s or m/s."""
+"""Maximum prior standard deviation of a velocity, rad/s or m/s."""
 UNMEASURED_PRIOR, UNMEASURED_SPEED = 0.3, 3.0
-"""The same of joints that are not recorded, rad or m, and per second."""
+"""Prior standard deviations of unrecorded joints: position in rad or m, velocity per second."""
 FIRST_FORCE = 0.1
-"""Missing force from which the fit of the process noise begins, as a share of a typical force."""
+"""Initial missing force of the process noise fit, as a share of a typical force."""
 MAX_LINEARISATIONS = 4
 """Maximum number of times the model is linearised about a motion that is smoothed with it."""
 LINEARISED_GAIN = 10.0
-"""Log likelihood that a linearisation must gain for another one."""
+"""Minimum gain in log-likelihood by a linearisation for which another one is made."""
 
 CORRELATIONS = (0.4, 0.6, 0.75, 0.85, 0.92, 0.96)
-"""Correlations of AR(1) sensor noise that are tried one after another while they gain."""
+"""Correlations of AR(1) sensor noise, tried in this order while the likelihood increases."""
 COLOURED = 5.0
-"""Log likelihood that a larger correlation must gain."""
+"""Minimum gain in log-likelihood by a larger correlation."""
 UNSOUND = 100.0
 """Mean square of the whitened innovations above which a linear model does not follow the runs."""
 MIN_LOSS_WITHOUT_FORCE = 20.0
-"""Twice the log likelihood that must be lost without process noise for a force to be missing."""
+"""Minimum loss in twice the log-likelihood without process noise that shows a missing force."""
 SIDE_BY_SIDE = 256
-"""Number of columns that go through the filter together, so that they stay in the cache."""
+"""Number of columns that pass through the filter together, so that they fit in the CPU cache."""
 
 
 @dataclass(frozen=True)
 class Columns:
-    """What candidates add to the states and readings of R runs.
+    """Inputs that candidates add to the states and readings of R runs.
 
     Attributes:
-        probes: of the K candidates.
-        places: (K,) the column of each; candidates that act alike share one.
-        sizes: (K,) the coefficient that each probe has.
+        probes: the K candidates.
+        places: (K,) column of each candidate; candidates with the same effect share a column.
+        sizes: (K,) scaling coefficient of each probe.
         pushed: (R, T - 1, E + nu, M) mean forces and controls of M columns between samples.
         readings: ψ (R, T, C, M).
     """
@@ -91,7 +93,7 @@ class Columns:
     readings: SingleArray
 
     def joined(self, others: Columns) -> Columns:
-        """Return these candidates with others behind them."""
+        """Return these candidates followed by others."""
         return Columns(
             self.probes + others.probes,
             np.concatenate([self.places, others.places + self.pushed.shape[3]]),
@@ -101,12 +103,14 @@ class Columns:
         )
 
     def total(self, chosen: Sequence[int], coefficients: Array) -> tuple[Array, Array]:
-        """Return what chosen candidates add together: forces and controls (R, T - 1, E + nu), and ψ
-        (R, T, C).
+        """Return the sum of the inputs of the chosen candidates.
 
         Args:
-            chosen: numbers of probes.
-            coefficients: of each.
+            chosen: indices of probes.
+            coefficients: coefficient of each chosen probe.
+
+        Returns:
+            Forces and controls (R, T - 1, E + nu), and ψ (R, T, C).
         """
         own = self.places[list(chosen)]
         weights = coefficients / self.sizes[list(chosen)]
@@ -115,17 +119,17 @@ class Columns:
 
 @dataclass
 class FollowedRuns:
-    """Runs of a robot that a filter with the model follows.
+    """Runs of a robot followed by a Kalman filter with the model.
 
     Attributes:
         world: the runs.
         theta: (P,) parameters of the model.
-        noise: of the sensors.
-        linear: the linearised model of each run.
+        noise: sensor noise.
+        linear: linearised model of each run.
         runs: the linear models, stacked, without states for coloured noise.
         force: (E,) standard deviations of the missing forces.
-        filtered: what the filter gives.
-        smoothed: what the smoother gives.
+        filtered: results of the filter.
+        smoothed: results of the smoother.
         typical: (E,) typical forces.
     """
 
@@ -154,10 +158,10 @@ class FollowedRuns:
         Args:
             world: the runs.
             theta: (P,) parameters of the model.
-            noise: of the sensors.
-            trajectories: the motion of each run, if it has been estimated before.
-            force: (E,) missing forces with which the fit of the process noise begins.
-            max_linearisations: maximum number of them, where the motion is not given.
+            noise: sensor noise.
+            trajectories: motion of each run, if it has been estimated before.
+            force: (E,) initial missing forces for the fit of the process noise.
+            max_linearisations: maximum number of linearisations if the motion is not given.
         """
         assert isinstance(world.simulator, RobotSimulator)
         robot = world.simulator.robot
@@ -165,7 +169,7 @@ class FollowedRuns:
         best: FollowedRuns | None = None
         linear: list[MeasuredLinear] = []
         for number in range(max_linearisations if trajectories is None else 1):
-            # Jacobians change little from one motion to another near the data.
+            # Near the data, Jacobians change little from one motion to another.
             nearby: Sequence[MeasuredLinear | None] = linear or [None] * len(world.tracks)
             motion: Sequence[Trajectory | None] = trajectories or [None] * len(world.tracks)
             linear = [
@@ -176,7 +180,7 @@ class FollowedRuns:
             found = cls._of_linear(world, theta, noise, linear, begin, typical)
             force, noise, trajectories = found.force, found.noise, found.trajectories
             gain = np.inf if best is None else found.log_likelihood - best.log_likelihood
-            # The first one is about the readings alone, which are not a motion.
+            # The first linearisation is about the readings alone, which are not a possible motion.
             best = found if number < 2 or gain > 0.0 else best
             if not gain > LINEARISED_GAIN:
                 break
@@ -186,13 +190,15 @@ class FollowedRuns:
     def with_parameters(
         self, theta: Array, simulator: RobotSimulator | None = None, is_alike: bool = False
     ) -> FollowedRuns:
-        """Return the filter of a model with other parameters, linearised once about this smoothed
-        motion, with process noise that begins from this one.
+        """Return the filter of a model with other parameters.
+
+        The model is linearised once about the smoothed motion of this filter, and its process noise
+        starts from the present one.
 
         Args:
             theta: (P,) the parameters.
-            simulator: in place of that of the world.
-            is_alike: whether these Jacobians are used again.
+            simulator: simulator to use instead of that of the world.
+            is_alike: whether the Jacobians of this filter are reused.
         """
         linear = [
             _linearised(self.world, theta, self.noise, run, motion, near, simulator, is_alike)
@@ -212,10 +218,10 @@ class FollowedRuns:
         typical: Array,
     ) -> FollowedRuns:
         """Filter the linearised models of all runs; other arguments as those of `_fit_noise`."""
-        # A model that diverges between two samples exceeds all numbers: its filter is not sound.
+        # A model that diverges between two samples overflows; `is_sound` is then false.
         with np.errstate(all="ignore"):
             maps = [one.interval_maps() for one in linear]
-            # An effect may have states of its own.
+            # An effect may have its own states.
             prior = _prior(world, linear, maps[0].states.shape[1])
             runs = LinearRuns.stacked(maps, world.observed, prior)
             fitted = _fit_noise(runs, noise, force, typical)
@@ -223,31 +229,39 @@ class FollowedRuns:
 
     @classmethod
     def of_model(cls, world: World, theta: Array, noise: Noise) -> FollowedRuns:
-        """Return the filter that the world keeps, where it is of this model; else a new one, which
-        the world keeps then.
+        """Return the filter stored in the world if it has these parameters, else a new one.
+
+        The new filter is stored in the world.
+
+        Args:
+            world: the runs.
+            theta: (P,) parameters of the model.
+            noise: sensor noise.
         """
         known: FollowedRuns | None = world.followed
         if known is not None and known.world is world and np.array_equal(known.theta, theta):
             return known
         world.watch.stage("following the runs with the model", 1)
         assert isinstance(world.simulator, RobotSimulator)
-        # Of other steps the motion is not known at the ends of these.
+        # With another step size, the motion at the ends of the steps is not known.
         alike = known is not None and known.step == world.simulator.step
         motion = known.trajectories if known is not None and alike else None
         followed = world.followed = cls.follow(world, theta, noise, motion)
         return followed
 
     def refitted(self, runs: LinearRuns) -> FollowedRuns:
-        """Return the filter of changed linear models, with the process noise and the correlation
-        of the sensor noise fitted again.
+        """Return the filter of changed linear models with refitted noise.
+
+        Process noise and the correlation of the sensor noise are fitted again.
         """
         return replace(
             self, runs=runs, **_fit_noise(runs, self.noise, self.force, self.typical)._asdict()
         )
 
     def whitened_innovations(self, theta: Array) -> Array:
-        """Return the whitened innovations (R, T, C) of a model with parameters nearby, filtered
-        about the same motion with the same process noise.
+        """Return the whitened innovations (R, T, C) of a model with similar parameters.
+
+        The model is linearised about the same motion and filtered with the same process noise.
         """
         maps = [
             _linearised(self.world, theta, self.noise, run, near.trajectory, near).interval_maps()
@@ -264,7 +278,7 @@ class FollowedRuns:
 
     @cached_property
     def losses_without_force(self) -> Array:
-        """(E,) by how much twice the log likelihood falls without each missing force."""
+        """Loss in twice the log-likelihood (E,) without each missing force."""
         coloured, white = with_coloured_noise(self.runs, self.noise)
         best = self.log_likelihood
         losses = []
@@ -277,7 +291,7 @@ class FollowedRuns:
 
     @property
     def missing_forces(self) -> Mask:
-        """(E,) whether the model lacks a force: the filter needs process noise there."""
+        """Whether the model lacks a force (E,), so that the filter needs process noise there."""
         mask: Mask = self.losses_without_force > MIN_LOSS_WITHOUT_FORCE
         return mask
 
@@ -288,14 +302,14 @@ class FollowedRuns:
 
     @property
     def joints_by_loss(self) -> list[int]:
-        """Numbers of the joints, that with the largest loss without process noise first."""
+        """Indices of the joints, in descending order of the loss without process noise."""
         joints = len(self.world.simulator.system.coordinates)
         order: list[int] = np.argsort(-self.losses_without_force[:joints], kind="stable").tolist()
         return order
 
     @property
     def step(self) -> float:
-        """Seconds of a step of the simulator."""
+        """Time step of the simulator in seconds."""
         return float(self.linear[0].step)
 
     @cached_property
@@ -311,10 +325,10 @@ class FollowedRuns:
         return found
 
     def columns(self, probes: Sequence[Probe]) -> Columns:
-        """Compute what candidates add to states and readings, each effect at one place once.
+        """Compute the inputs that candidates add to states and readings, once per effect and place.
 
         Args:
-            probes: of the candidates.
+            probes: the candidates.
         """
         effects: list[tuple[Effect, Array]] = []
         known: dict[tuple[str, bytes], int] = {}
@@ -322,7 +336,7 @@ class FollowedRuns:
         for probe in probes:
             effect, c = self.world.effects[probe.effect], probe.c
             parts = [(one, k) for one, k in effect.parts(c[:, None, None]) if k.any()]
-            # A member of a family acts as it does alone.
+            # A member of a family has the same response as the single effect.
             if len(parts) == 1:
                 effect, c = parts[0][0], parts[0][1][:, 0, 0]
             key = effect.name, c.tobytes()
@@ -353,21 +367,27 @@ class FollowedRuns:
         return response
 
     def responses(self, columns: Columns) -> SingleArray:
-        """Carry columns through the filter by (1): whitened responses (R, T, C, K), in units of
-        the probes' coefficients.
+        """Propagate columns through the filter by (1).
+
+        Args:
+            columns: inputs of the candidates.
+
+        Returns:
+            Whitened responses (R, T, C, K), in units of the probes' coefficients.
         """
         inputs = self.runs.inputs.astype(np.float32)
         found = self._through_filter(columns.pushed, columns.readings, inputs)
         sizes: SingleArray = columns.sizes.astype(np.float32)
         with np.errstate(all="ignore"):
             result: SingleArray = found[..., columns.places] / sizes
-        # A candidate with which the motion diverges has no response.
+        # A candidate with a divergent motion gets a response of zero.
         result[~(np.abs(result) < LARGEST)] = 0.0
         return result
 
     def state_sensitivities(self) -> Array:
-        """Return the derivatives (R, T, C, 2 D) of the readings by the first positions and
-        velocities of D joints, without any feedback of the readings.
+        """Return the derivatives (R, T, C, 2 D) of the readings by the first states of D joints.
+
+        The first states are positions and velocities; readings are not fed back.
         """
         joints = len(self.linear[0].trajectory.x[0])
         own = np.concatenate([np.arange(joints), self.linear[0].positions + np.arange(joints)])
@@ -378,8 +398,9 @@ class FollowedRuns:
         return result
 
     def sensitivities(self, columns: Columns) -> Array:
-        """Return what candidates change about the readings of simulated runs (R, T, C, K), by (1)
-        without gain, in units of the probes' coefficients.
+        """Return the changes of the readings of simulated runs (R, T, C, K) by candidates.
+
+        They follow from (1) without gain, in units of the probes' coefficients.
         """
         number, _, _, count = columns.readings.shape
         changes = self._without_gain(np.zeros((number, self.runs.prior.size, count)), columns)
@@ -387,8 +408,14 @@ class FollowedRuns:
             return changes[..., columns.places] / columns.sizes
 
     def _without_gain(self, s: Array, columns: Columns | None = None) -> Array:
-        """Carry changes of the first states (R, Z, K), and columns if there are any, through (1)
-        without gain.
+        """Propagate first states and optional columns by (1) without gain.
+
+        Args:
+            s: (R, Z, K) changes of the first states.
+            columns: inputs of candidates; None if there are none.
+
+        Returns:
+            Changes of the readings (R, T, C, K).
         """
         runs = self.runs
         samples = runs.residuals.shape[1]
@@ -407,17 +434,17 @@ class FollowedRuns:
 
     @property
     def is_sound(self) -> bool:
-        """Whether the filter follows the runs: its innovations are of the size that it expects."""
+        """Whether the filter follows the runs: its innovations have the expected size."""
         with np.errstate(all="ignore"):
             size = float(np.square(self.filtered.whitened).sum()) / max(self.runs.recorded.sum(), 1)
         return bool(size < UNSOUND)
 
     def state_prior(self) -> Array | None:
-        """Return standard deviations (2 D,) of the first positions and velocities of the joints,
-        or None where other states are fitted besides.
+        """Return the prior standard deviations (2 D,) of the first positions and velocities.
 
-        A stiff servo forgets the first velocity within a sample. Without a limit a fit would make
-        it so large that the motion leaves the range of the linear model.
+        The result is None if further states are fitted. With a stiff servo, the first velocity
+        decays within a sample. Without a prior, a fit would make it so large that the motion leaves
+        the valid range of the linear model.
         """
         joints = len(self.linear[0].trajectory.x[0])
         if len(self.world.states) != 2 * joints:
@@ -427,7 +454,7 @@ class FollowedRuns:
         return np.concatenate([own[:joints], velocities])
 
     def first_positions(self) -> Array:
-        """Return smoothed positions of the joints at the first samples (R, D)."""
+        """Return the smoothed positions of the joints at the first samples (R, D)."""
         found = []
         for run, linear in enumerate(self.linear):
             x = linear.trajectory.x[int(linear.knots[0])]
@@ -435,9 +462,10 @@ class FollowedRuns:
         return np.array(found)
 
     def first_states(self) -> Array:
-        """Return positions and velocities of the joints at the first samples (R, 2 D): those of the
-        readings alone where they are recorded, since a stiff servo hides the first velocity from a
-        linear model, and smoothed ones of other joints.
+        """Return positions and velocities of the joints at the first samples (R, 2 D).
+
+        For recorded joints they are estimated from the readings alone, because a stiff servo hides
+        the first velocity from a linear model; for other joints they are smoothed states.
         """
         found = []
         for run, trajectory in enumerate(self.trajectories):
@@ -451,12 +479,12 @@ class FollowedRuns:
     def _through_filter(
         self, pushed: SingleArray, readings: SingleArray, inputs: SingleArray | None = None
     ) -> SingleArray:
-        """Carry columns through (1).
+        """Propagate columns through (1).
 
         Args:
-            pushed: (R, T - 1, E + nu, M) forces and controls, or states where `inputs` is None.
+            pushed: (R, T - 1, E + nu, M) forces and controls, or states if `inputs` is None.
             readings: ψ (R, T, C, M).
-            inputs: (R, T - 1, Z, E + nu) what makes b of them.
+            inputs: (R, T - 1, Z, E + nu) matrices that map `pushed` to b.
         """
         coloured, _ = with_coloured_noise(self.runs, self.noise)
         number, samples, channels, count = readings.shape
@@ -485,8 +513,13 @@ class FollowedRuns:
 
 
 class _NoiseFit(NamedTuple):
-    """Noise of the sensors, standard deviations of the missing forces (E,), and what filter and
-    smoother give with them.
+    """Fitted noise, with the results of filter and smoother.
+
+    Attributes:
+        noise: sensor noise.
+        force: (E,) standard deviations of the missing forces.
+        filtered: results of the filter.
+        smoothed: results of the smoother.
     """
 
     noise: Noise
@@ -500,8 +533,8 @@ def _fit_noise(runs: LinearRuns, noise: Noise, force: Array, typical: Array) -> 
 
     Args:
         runs: the linear models.
-        noise: of the sensors; larger correlations than these are tried.
-        force: (E,) standard deviations of the missing forces with which the fit begins.
+        noise: sensor noise; larger correlations are tried, too.
+        force: (E,) initial standard deviations of the missing forces.
         typical: (E,) typical forces.
     """
     best: _NoiseFit | None = None
@@ -512,7 +545,7 @@ def _fit_noise(runs: LinearRuns, noise: Noise, force: Array, typical: Array) -> 
         if best is not None:
             found = filter_runs(coloured, best.force, white)
             before, after = best.filtered.log_likelihood.sum(), found.log_likelihood.sum()
-            # Both are minus infinity where the model diverges.
+            # Both are minus infinity if the model diverges.
             if not after > before + COLOURED:
                 break
             force = best.force
@@ -531,7 +564,10 @@ def _linearised(
     simulator: RobotSimulator | None = None,
     is_alike: bool = True,
 ) -> MeasuredLinear:
-    """Linearise the model of one run about a motion; None stands for that of its readings alone."""
+    """Linearise the model of one run about a motion.
+
+    The motion `trajectory` is estimated from the readings alone if it is None.
+    """
     half = len(world.states) // 2
     scenario = world.tracks[run].scenario
     start = world.guess[run, :half], world.guess[run, half:]
@@ -543,9 +579,10 @@ def _linearised(
 
 
 def _prior(world: World, linear: Sequence[MeasuredLinear], size: int) -> Array:
-    """(Z,) standard deviations of the first states about the measured motion.
+    """Return standard deviations (Z,) of the first states about the measured motion.
 
-    A stiff servo forgets the first velocity within a sample, so that the readings do not fix it.
+    With a stiff servo, the first velocity decays within a sample, so the readings do not determine
+    it.
     """
     coordinates = world.simulator.system.coordinates
     prior = np.full(size, 1e-9)

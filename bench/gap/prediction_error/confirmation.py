@@ -1,10 +1,10 @@
-"""Confirm by simulation what prediction errors select, and judge it.
+"""Confirm by simulation what prediction errors select, and determine the verdict.
 
-1. The selected set, fitted to whole simulated runs, and its rivals.
-2. Held-out runs: an effect that makes them worse is removed.
-3. Is a force of any shape left (`bench.gap.causes.structure`)?
-4. Which other effects explain the same as well?
-5. The verdict, by the rules of `bench.gap.causes.rules`.
+1. Fit the selected set and its rivals to whole simulated runs.
+2. Remove effects that make predictions of held-out runs worse.
+3. Test whether a force of any shape is missing (`bench.gap.causes.structure`).
+4. Collect other effects that explain the data as well.
+5. Determine the verdict by the rules of `bench.gap.causes.rules`.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from bench.gap.prediction_error.null_distribution import p_value_of_gain
 from bench.gap.prediction_error.search import PredictionErrorSearch
 
 MIMICRY = 0.5
-"""Effects that close a smaller share of the gap are not told where the cause is unknown."""
+"""Minimum share of the discrepancy that reported effects remove if the cause is unknown."""
 NEAR = 15.0
-"""Rivals this near in twice the log likelihood are measured on held-out runs."""
+"""Maximum distance in twice the log-likelihood of rivals that are evaluated on held-out runs."""
 
 
 class Confirmation(Inquiry):
-    """The questions about a robot's recording, in their order.
+    """The steps of the diagnosis of a robot's recording.
 
     Args:
-        search: by prediction errors, with the base model entered.
-        held_out: the runs for measuring; None if there are none.
+        search: search by prediction errors, which contains the fitted base model.
+        held_out: held-out runs for validation; None if there are none.
     """
 
     def __init__(self, search: Search, held_out: Validation | None) -> None:
@@ -42,10 +42,10 @@ class Confirmation(Inquiry):
         self._robot = search
 
     def answered(self) -> Finding:
-        """The finding when all is answered.
+        """Return the result of the complete diagnosis.
 
         Raises:
-            EndedError: the search has to end before.
+            EndedError: the search had to end early.
         """
         search, watch = self._robot, self._watch
         unfit = self.unfit_base()
@@ -59,7 +59,8 @@ class Confirmation(Inquiry):
         size = len(self._model.names)
         self._measure()
         if 0 < len(self._model.names) < size:
-            # What does as well in place of an effect was fitted beside those that are removed.
+            # The rivals of the remaining effects were fitted together with the removed ones, so fit
+            # them again.
             self._model = search.fit_rivals(self._model)
             self._measure()
         watch.begin("structure")
@@ -78,12 +79,12 @@ class Confirmation(Inquiry):
         )
         verdict = verdict_of(state)
         if verdict == "unknown" and state.closed < MIMICRY:
-            # Effects that leave so much only mimic what is missing.
+            # Effects that leave most of the discrepancy only mimic what is missing.
             model, causes = base, ()
         return self._finding(verdict, base, model, causes, left)
 
     def _measure(self) -> None:
-        """Measure the models on the held-out runs, and remove effects that do not help there."""
+        """Evaluate the models on held-out runs, and remove effects that do not help there."""
         if self._held_out is None or self._model is None:
             return
         search, model = self._robot, self._model
@@ -105,7 +106,7 @@ class Confirmation(Inquiry):
 
 @dataclass(frozen=True)
 class _RobotAlternatives(Alternatives):
-    """Collects alternatives of a robot's effects; p-values by the chi squared distribution."""
+    """Collects alternatives of a robot's effects; p-values are those of the chi-squared law."""
 
     def _p_value(self, rest: Model, effect: str, gain: float) -> float:  # noqa: ARG002
         slot = self.search.world.slots[effect]

@@ -1,7 +1,7 @@
 """Dry friction of a selection, and its form.
 
-The force of dry friction is not linear in its limit where a joint sticks or creeps. So it is fitted
-alone before other effects are, and filters compare whether it has MuJoCo's soft form.
+The force of dry friction is not linear in its limit where a joint sticks or creeps. Therefore it is
+fitted before other effects, and filters compare whether it has MuJoCo's soft form.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class SoftFrictionError(Exception):
     """Dry friction of these data has MuJoCo's soft form: search with a simulator of that form.
 
     Attributes:
-        start: the model whose filter says so; None where simulation does.
-        is_preliminary: whether filters alone say so, before anything was fitted.
+        start: the model whose filter shows this; None if a simulation does.
+        is_preliminary: whether only filters show this, before any fit.
     """
 
     def __init__(self, start: Start | None = None, is_preliminary: bool = False) -> None:
@@ -39,14 +39,18 @@ class SoftFrictionError(Exception):
 def check_selection(context: SearchContext, selected: Selected) -> None:
     """Compare a selection with soft dry friction, before anything is fitted.
 
+    Args:
+        context: context of the search.
+        selected: the selection.
+
     Raises:
-        SoftFrictionError: that is likelier than the selection.
+        SoftFrictionError: soft friction is likelier than the selection.
     """
     filters = context.filters
     if filters.is_soft or not filters.base.lacks_force:
         return
     friction = dry_friction_of(context, selected)
-    # Stiff friction that explains the runs is not compared.
+    # Stiff friction that explains the runs needs no comparison.
     if friction.effects and is_explained(context, context.search.fit_one(friction)):
         return
     kept = without_surplus(context, selected)
@@ -57,15 +61,15 @@ def check_selection(context: SearchContext, selected: Selected) -> None:
 def check_filter(
     context: SearchContext, log_likelihood: float, is_preliminary: bool = False
 ) -> None:
-    """Compare the log likelihood of a filter with that of soft dry friction.
+    """Compare the log-likelihood of a filter with that of soft dry friction.
 
     Args:
-        context: of the search.
-        log_likelihood: of the filter.
+        context: context of the search.
+        log_likelihood: log-likelihood of the filter.
         is_preliminary: whether nothing has been fitted yet.
 
     Raises:
-        SoftFrictionError: that is likelier.
+        SoftFrictionError: soft friction is likelier.
     """
     soft = context.filters.soft_friction
     if soft is None:
@@ -78,8 +82,12 @@ def check_filter(
 def check_fit(context: SearchContext, model: Model) -> None:
     """Compare a fitted model with the same effects in the soft form of dry friction.
 
+    Args:
+        context: context of the search.
+        model: the fitted model.
+
     Raises:
-        SoftFrictionError: that is likelier.
+        SoftFrictionError: the soft form is likelier.
     """
     if is_likelier_soft(context.search, model, SWITCH):
         raise SoftFrictionError
@@ -88,8 +96,13 @@ def check_fit(context: SearchContext, model: Model) -> None:
 def fit_dry_friction(context: SearchContext, selected: Selected) -> Model:
     """Fit the dry friction of a selection alone.
 
-    Return the base model where no force is missing in addition to the selection, or where it has no
-    friction.
+    Args:
+        context: context of the search.
+        selected: the selection.
+
+    Returns:
+        The fitted model, or the base model if the selection has no friction or leaves no force
+        missing.
     """
     friction = dry_friction_of(context, selected)
     if not friction.effects or not selected.followed.lacks_force:
@@ -102,8 +115,13 @@ def fit_dry_friction(context: SearchContext, selected: Selected) -> Model:
 
 
 def dry_friction_of(context: SearchContext, selected: Selected) -> Start:
-    """Return the model of the dry friction of a selection without a state, and nothing else of it;
-    a family in place of its members.
+    """Return a start with only the dry friction of a selection, in its form without a state.
+
+    A family replaces its members.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
     """
     world, filters = context.world, context.filters
     start = context.columns.start(selected.groups, selected.coefficients)
@@ -119,10 +137,10 @@ def dry_friction_of(context: SearchContext, selected: Selected) -> Start:
 
 
 def stands_alone(context: SearchContext, selected: Selected, friction: Model) -> bool:
-    """Whether dry friction without a state follows the data as well as what was selected.
+    """Return whether dry friction without a state follows the data as well as the selection.
 
     Args:
-        context: of the search.
+        context: context of the search.
         selected: the selection.
         friction: its dry friction, fitted alone.
 

@@ -1,8 +1,8 @@
-"""Propose effects that a model may lack: those that gain most by regression, and those of the
-standard joint model at the joint where most is missing.
+"""Propose effects that a model may lack, by regression and from the standard joint model.
 
-A regression may miss the latter: they are not linear where a joint sticks, where a servo is stiff
-for a light joint, and where an encoder's offset changes the pose.
+Effects of the joint model are proposed at the joint with the largest missing force. A regression
+may miss them: they are not linear where a joint sticks, where a servo is stiff for a light joint,
+and where an encoder offset changes the pose.
 """
 
 from __future__ import annotations
@@ -35,23 +35,21 @@ MAX_REGRESSION_PROPOSALS = 4
 MAX_JOINT_PROPOSALS = 3
 """Maximum number of effects of the joint and servo models that are added to a set."""
 MIN_GAIN_SHARE = 0.3
-"""Share of the largest gain by regression that an effect must have to be proposed."""
+"""Minimum gain by regression of a proposed effect, as a share of the largest gain."""
 FIRST_SHARE = 0.1
-"""Initial coefficient as a share of the stated friction or of the typical force."""
+"""Initial coefficient, as a share of the specified friction or of the typical force."""
 
 Proposals = list[tuple[str, Array]]
-"""Names of effects, each with its first coefficients (k,)."""
+"""Names of effects, each with its initial coefficients (k,)."""
 
 
 @dataclass
 class EffectProposals:
-    """The proposals of a search.
+    """The proposals of a search; those for the base model are cached.
 
     Attributes:
         filters: the filters of the search.
         columns: the columns of the search.
-
-    Those for the base model are kept, by the number of columns of the library.
     """
 
     filters: ModelFilters
@@ -74,7 +72,7 @@ class EffectProposals:
         return [with_effect(world, own, name, c) for name, c in first + joint_model[:most]]
 
     def _propose(self, current: FilteredSet) -> tuple[Proposals, Proposals]:
-        """Return all proposals, those of the joint and servo models apart."""
+        """Return all proposals, with those of the joint and servo models in a separate list."""
         found = self._by_regression(current)
         others, joint = {*current.names, *dict(found)}, current.followed.joints_by_loss[0]
         joint_model = self._joint_model(current.followed, joint, others)
@@ -97,8 +95,9 @@ class EffectProposals:
         return list(found.items())
 
     def _offset_and_friction(self, joint: int, excluded: Collection[str]) -> Proposals:
-        """Return the offset of a joint's encoder, and less dry friction than the model file states,
-        which a derivative by more friction does not tell.
+        """Return an encoder offset of a joint, and less dry friction than the model file specifies.
+
+        The derivative by more friction does not show the effect of less friction.
         """
         world, place = self.filters.world, joint_name(self.filters.world, joint)
         found = {f"sensor.bias@q.{place}": offset_from_command(world, self.filters.noise, joint)}
@@ -114,8 +113,9 @@ class EffectProposals:
     def _joint_model(
         self, followed: FollowedRuns, joint: int, excluded: Collection[str]
     ) -> Proposals:
-        """Return viscous and dry friction and armature of a joint, and stiffness and damping of its
-        servo, those first by which the likelihood gains most.
+        """Return friction, damping and armature of a joint, and stiffness and damping of its servo.
+
+        They are in descending order of their gain in likelihood.
         """
         world, place = self.filters.world, joint_name(self.filters.world, joint)
         assert isinstance(world.simulator, RobotSimulator)
@@ -133,7 +133,7 @@ class EffectProposals:
                 places, bounds = world.places(name), coefficient_bounds(world, name)
                 step, gain = gauss_newton_step(followed, places, bounds)
                 change = float(step[places[0]])
-                # Where much process noise hides an effect, its typical size is tried.
+                # If much process noise hides an effect, its typical size is tried.
                 if not gain > 0.5 * self.filters.penalty(name):
                     change = typical.get(name, float(np.copysign(FIRST_SHARE, change)))
                 found.append((gain, name, np.array([change])))

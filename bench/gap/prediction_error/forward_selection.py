@@ -1,9 +1,9 @@
-"""Grow sets of effects one by one, each chosen by whole filters with the effect in the model.
+"""Grow sets of effects one by one, each selected by filters with the effect in the model.
 
-Where much is missing, the noise of the measured motion is in the innovations and in the responses
-of effects that follow the same readings, and regression prefers these. A filter with the right
-effect in the model needs no process noise any more (forward selection; A. Miller, Subset Selection
-in Regression, 2nd ed., 2002, chapter 3).
+If large forces are missing, the noise of the measured motion appears both in the innovations and in
+the responses of effects that depend on the same readings, and regression prefers these effects. A
+filter with the right effect in its model needs no process noise (forward selection; A. Miller,
+Subset Selection in Regression, 2nd ed., 2002, chapter 3).
 """
 
 from __future__ import annotations
@@ -38,19 +38,24 @@ MAX_STEPS = 4
 MAX_IMPROVED_TRIALS = 3
 """Maximum number of tried effects whose coefficients are improved at each step."""
 SETTLED_SHARE = 0.1
-"""Share of a gain by which another trial must be behind not to be improved."""
+"""Minimum distance of a trial that is not improved, as a share of the gain of the best one."""
 MAX_FIRST_EFFECTS = 2
-"""Number of the likeliest trials that are fitted by simulation, however far behind the best."""
+"""Number of the likeliest trials that are fitted by simulation, at any distance from the best."""
 ALL_SERVOS_STEPS = 6
 """Maximum number of Gauss-Newton steps for the coefficients of all servos."""
 RIVAL_MARGIN = 20.0
-"""Sets this near in twice the log likelihood are compared by simulation."""
+"""Maximum distance in twice the log-likelihood of sets that are compared by simulation."""
 LINEARISATION_ERROR = 0.03
-"""Share of a gain by which it may be wrong, since responses are linear."""
+"""Maximum relative error of a gain that is computed from linear responses."""
 
 
 def add_to_model(context: SearchContext, model: Model) -> Model:
-    """Add effects to a fitted model while each pays, and fit the set."""
+    """Add effects to a fitted model as long as each pays, and fit the set.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+    """
     begin = FilteredSet(context.filters.of_model(model), model.names)
     larger = _grow(context, begin)
     if larger is begin:
@@ -61,12 +66,13 @@ def add_to_model(context: SearchContext, model: Model) -> Model:
 def add_to_dry_friction(context: SearchContext, selected: Selected, friction: Model) -> Model:
     """Add effects to the dry friction of a selection.
 
-    Return the base model where it has none, or where the selection does better.
-
     Args:
-        context: of the search.
+        context: context of the search.
         selected: the selection.
         friction: its dry friction, fitted alone.
+
+    Returns:
+        The best model, or the base model if the selection has no friction or is likelier.
 
     Raises:
         SoftFrictionError: the friction has MuJoCo's soft form.
@@ -80,8 +86,8 @@ def select_in_model(context: SearchContext, friction: Start | None = None) -> Mo
     """Add effects one after another to dry friction, or to the base model.
 
     Args:
-        context: of the search.
-        friction: dry friction that is in the model from the beginning, if any is.
+        context: context of the search.
+        friction: dry friction that is in the model from the start, if any.
 
     Raises:
         SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
@@ -102,7 +108,7 @@ def select_in_model(context: SearchContext, friction: Start | None = None) -> Mo
     if friction is None and not is_explained(context, best) and not watch.left():
         check_filter(context, first[0].followed.log_likelihood)
         best = higher_merit(best, _fit_all_servos(context))
-    # Two effects may explain together what neither explains alone.
+    # Two effects together may explain what neither explains alone.
     if first and not is_explained(context, best) and not watch.left():
         best = higher_merit(best, fit_filtered(context, _grow(context, first[0])))
     if not np.isfinite(best.fit.cost) or not best.names:
@@ -113,7 +119,7 @@ def select_in_model(context: SearchContext, friction: Start | None = None) -> Mo
 
 
 def _grow(context: SearchContext, current: FilteredSet) -> FilteredSet:
-    """Add effects to a set while each pays."""
+    """Add effects to a set as long as each pays."""
     for _ in range(MAX_STEPS - 1):
         larger = _larger_that_pay(context, current) if current.followed.lacks_force else []
         if not larger:
@@ -139,7 +145,12 @@ def _larger_that_pay(context: SearchContext, current: FilteredSet) -> list[Filte
 def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredSet]:
     """Follow the runs with each effect that gains most in addition to a set.
 
-    Return the likeliest sets, the likeliest first; none where no effect gains.
+    Args:
+        context: context of the search.
+        current: the set.
+
+    Returns:
+        The larger sets, the likeliest first; empty if no effect gains.
     """
     watch, filters = context.world.watch, context.filters
     watch.stage("testing effects in the model one by one", MAX_REGRESSION_PROPOSALS)
@@ -161,7 +172,7 @@ def try_one_more(context: SearchContext, current: FilteredSet) -> list[FilteredS
 
 
 def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -> bool:
-    """Whether a set explains the runs, and another one is far behind."""
+    """Return whether a set explains the runs, and another one is far worse."""
     behind = _criterion(context, other) - _criterion(context, best)
     far = behind > RIVAL_MARGIN + SETTLED_SHARE * _gain(context, best)
     return far and not best.followed.lacks_force
@@ -170,7 +181,7 @@ def _is_settled(context: SearchContext, best: FilteredSet, other: FilteredSet) -
 def _nearly_as_likely(
     context: SearchContext, tried: Sequence[FilteredSet]
 ) -> Sequence[FilteredSet]:
-    """Return the sets that simulation has to decide between, the likeliest first."""
+    """Return the sets between which simulation has to decide, the likeliest first."""
     if not tried:
         return ()
     error = LINEARISATION_ERROR * _gain(context, tried[0])
@@ -192,7 +203,8 @@ def _criterion(context: SearchContext, current: FilteredSet) -> float:
 
 
 def _fit_all_servos(context: SearchContext) -> Model:
-    """Fit stiffness and damping of all servos together, where forces are missing at several joints.
+    """Fit stiffness and damping of all servos together, if forces are missing at several joints.
+
     Another effect may gain more than the stiffness or the damping alone.
     """
     names = [f"{effect}@*" for effect in SERVO_MODEL]

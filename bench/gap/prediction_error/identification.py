@@ -1,10 +1,10 @@
-"""Select the effects that a robot's model lacks, with the process noise fitted in between.
+"""Select the effects that a robot's model lacks, with repeated fits of the process noise.
 
     1. Follow the runs with the model by a Kalman filter about the measured motion.
     2. Compute the response of the innovations to every candidate effect.
     3. Select effects by regression, whatever their number.
-    4. Put them into the linear model, fit the process noise again, and go on at 3, since with less
-       process noise the innovations show more.
+    4. Put them into the linear model, fit the process noise again, and continue with 3, because the
+       innovations contain more information with less process noise.
 
 (L. Ljung, System Identification, 2nd ed., 1999, chapters 3, 7 and 16.)
 """
@@ -22,7 +22,7 @@ from bench.gap.prediction_error.selection import Regression, columns_of, groups_
 from sims.base import Array
 
 PASSES = 4
-"""Maximum number of regressions, each with the process noise that the last selection leaves."""
+"""Maximum number of regressions, each with the process noise of the previous selection."""
 MOST = 8
 """Maximum number of effects in a set."""
 
@@ -33,11 +33,11 @@ class Selected:
 
     Attributes:
         groups: the selected groups of columns.
-        coefficients: of each group, in units of the probes' coefficients.
+        coefficients: coefficients of each group, in units of the probes' coefficients.
         regression: the last regression.
-        log_likelihood: of the innovations with the selected effects.
+        log_likelihood: log-likelihood of the innovations with the selected effects.
         followed: the runs, with the selected effects in the linear model.
-        numerics: share of the errors of the integrator's steps in the linear model.
+        numerics: share of the integrator's step errors in the linear model.
         shows_steps: whether the innovations show these errors.
     """
 
@@ -56,8 +56,9 @@ class Selected:
 
 
 def shows_step_errors(followed: FollowedRuns) -> bool:
-    """Whether the innovations show the errors of the integrator's steps, as they do where the
-    recorded motion is that of continuous time, and not where the engine itself made it.
+    """Return whether the innovations show the errors of the integrator's steps.
+
+    They do if the recorded motion is one of continuous time, and do not if the engine generated it.
     """
     return regress(followed, followed.columns([])).shows_nuisance([])
 
@@ -67,7 +68,7 @@ def identify(followed: FollowedRuns, columns: Columns) -> Selected:
 
     Args:
         followed: the runs, without any effect.
-        columns: of the candidates.
+        columns: inputs of the candidates.
     """
     now, chosen = followed, list[Group]()
     coefficients: list[Array] = []
@@ -107,15 +108,15 @@ def regress(
     numerics: float = 0.0,
     always: Sequence[int] = (),
 ) -> Regression:
-    """Set up the regression of all that effects explain, those in the linear model included.
+    """Set up the regression of all that effects explain, including those in the linear model.
 
     Args:
         now: the runs, filtered with the chosen effects in the linear model.
-        columns: of the candidates.
-        chosen: these effects.
-        coefficients: theirs.
+        columns: inputs of the candidates.
+        chosen: the effects in the linear model.
+        coefficients: coefficients of these effects.
         numerics: share of the integrator's errors that is in the linear model.
-        always: numbers of probes that are in every set, and candidates no more.
+        always: indices of probes that are part of every set, and are not candidates.
     """
     responses = now.responses(columns)
     number, _, _, count = responses.shape
@@ -145,7 +146,15 @@ def with_effects(
     coefficients: Sequence[Array],
     numerics: float,
 ) -> FollowedRuns:
-    """Put effects into the linear model, and fit the process noise again."""
+    """Put effects into the linear model, and fit the process noise again.
+
+    Args:
+        followed: the runs, without any effect.
+        columns: inputs of the candidates.
+        chosen: groups of columns of the effects.
+        coefficients: coefficients of each group.
+        numerics: share of the integrator's errors to put into the linear model.
+    """
     own = [c for group in chosen for c in group.columns]
     runs = followed.runs
     defects, residuals = runs.defects - numerics * runs.step_errors, runs.residuals

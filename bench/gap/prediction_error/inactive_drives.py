@@ -1,30 +1,31 @@
-"""Find samples of a robot's recording in which a drive does nothing, before anything is fitted.
+"""Find samples of a robot's recording in which a drive exerts no force, before any fit.
 
-A drive that is switched off, a servo that is limp after a fault and an emergency stop leave the
-commands going on. Every effect of the library could only imitate that. From positions alone come
-velocities and accelerations (`measured_states`), and from these three forces at each joint and
-sample: the force that the motion needs by inverse dynamics, f; the force of the model's drive, τ;
-and the force that holds the joint still, g. Three hypotheses leave
+If a drive is switched off, if a servo is limp after a fault, or after an emergency stop, the
+commands continue. Effects of the library could only imitate this. Velocities and accelerations are
+estimated from positions alone (`measured_states`), and from them three forces at each joint and
+sample: the force f that the motion requires by inverse dynamics, the force τ of the model's drive,
+and the force g that holds the joint still. Three hypotheses have the residuals
 
     on: f - τ,        off: f,        held (by a brake): f - g                                    (1)
 
-A sequence of hypotheses with few changes follows by dynamic programming (A. J. Viterbi 1967,
+A sequence of hypotheses with few changes is found by dynamic programming (A. J. Viterbi 1967,
 doi:10.1109/TIT.1967.1054010). A sample costs min(|e| / s, `MAX_SAMPLE_COST`), with s the median of
-the smallest of (1), and each change costs `CHANGE_COST`. A stretch that is off or held is accepted
-only if
+the smallest of (1), and each change costs `CHANGE_COST`. An interval that is off or held is
+accepted only if
 
-* the force that the model's drive misses there is `MIN_MISSED_RATIO` times that elsewhere: a wrong
-  gain, friction or dead zone is wrong everywhere;
-* its hypothesis leaves at most `MAX_RESIDUAL_SHARE` of that force, and of what the drive exerts
+* the force error of the model's drive there is at least `MIN_MISSED_RATIO` times that elsewhere: a
+  wrong gain, friction or dead zone is wrong everywhere;
+* its hypothesis leaves at most `MAX_RESIDUAL_SHARE` of that force, and of the force of the drive
   elsewhere: a drive at its force limit exerts more than elsewhere;
-* there are at most `MAX_STRETCHES` of them in a run.
+* a run has at most `MAX_STRETCHES` such intervals.
 
-Magnitudes are the quantile `MAGNITUDE_QUANTILE` over all such stretches of a joint. Among 500
-random effects of the library at an arm with motors or servos, four were taken for a drive that does
-nothing.
+Magnitudes are the quantile `MAGNITUDE_QUANTILE` over all such intervals of a joint. Among 500
+random effects of the library on an arm with motors or servos, four were mistaken for an inactive
+drive.
 
-All drives are held at once, up to the end of a run or from its beginning, and the first two
-conditions are those of one of them: a joint that presses against a stop stands still, too.
+For the hypothesis "held", all drives are held at once, at the end or the beginning of a run, and
+the first two conditions apply to one of them: a joint that presses against a stop does not move,
+either.
 """
 
 from __future__ import annotations
@@ -54,47 +55,46 @@ from sims.robot.model import Robot
 Mask = NDArray[np.bool_]
 
 ON, OFF, HELD = 0, 1, 2
-"""Numbers of the hypotheses."""
+"""Hypotheses about a drive: it is on, it is off, or its joint is held by a brake."""
 MAX_SAMPLE_COST = 8.0
-"""Maximum cost of a sample, so that single samples decide nothing."""
+"""Maximum cost of a sample, so that no single sample decides."""
 CHANGE_COST = 40.0
 """Cost of a change from one hypothesis to another."""
 MAX_EXTRA_COST = 0.5
-"""Share of `CHANGE_COST` by which a column may exceed the cost of the likeliest stretches, for each
-change.
+"""Maximum extra cost of a column over the likeliest intervals, per change.
+
+It is a share of `CHANGE_COST`.
 """
 MAGNITUDE_QUANTILE = 0.8
 """Quantile by which magnitudes are compared."""
 MIN_MISSED_RATIO = 2.0
-"""Minimum ratio of the force that the model misses within the stretches to that elsewhere."""
+"""Minimum ratio of the force error of the model within the intervals to that elsewhere."""
 MAX_RESIDUAL_SHARE = 0.4
-"""Maximum share of a force that a hypothesis may leave unexplained over all stretches."""
+"""Maximum residual of a hypothesis over all intervals, as a share of the force."""
 MAX_STRETCH_SHARE = 0.6
-"""Maximum share that a hypothesis may leave unexplained in a single stretch."""
+"""Maximum residual of a hypothesis in a single interval, as a share of the force."""
 MAX_STILL_SPEED = 0.1
 """Maximum velocity of a joint that is held, as a share of its usual velocity."""
 MAX_STRETCHES = 3
-"""Maximum number of stretches of a run."""
+"""Maximum number of inactive intervals in a run."""
 MIN_SAMPLES = 20
-"""Minimum number of samples of a stretch, and of those in which a drive works."""
+"""Minimum number of samples in an interval, and in the part in which a drive works."""
 EDGE_SAMPLES = 5
-"""Number of samples on either side of a change in which the smoothed motion does not tell when it
-was.
-"""
+"""Number of samples on either side of a change in which the smoothed motion is blurred."""
 MAX_SAMPLES = 20_000
 """Maximum number of samples at which forces are computed."""
 MIN_SCALE_SHARE = 1e-3
-"""Minimum of s, as a share of the force that the motion needs."""
+"""Minimum of the scale s, as a share of the force that the motion requires."""
 
 
 class JointForces(NamedTuple):
     """Forces at the D joints of a robot in the T samples of a run, (T, D) each.
 
     Attributes:
-        needed: by the measured motion.
-        driven: what the model's drives exert on it.
-        holding: what holds the joints still.
-        velocity: of the joints.
+        needed: forces that the measured motion requires.
+        driven: forces of the model's drives at the measured motion.
+        holding: forces that hold the joints still.
+        velocity: velocities of the joints.
     """
 
     needed: Array
@@ -103,22 +103,22 @@ class JointForces(NamedTuple):
     velocity: Array
 
     def residuals(self, joint: int) -> Array:
-        """(3, T) what the hypotheses (1) leave at a joint."""
+        """Return the residuals (3, T) of the hypotheses (1) at a joint."""
         needed = self.needed[:, joint]
         return np.stack([needed - self.driven[:, joint], needed, needed - self.holding[:, joint]])
 
 
 @dataclass(frozen=True)
 class InactiveDrive:
-    """A drive that does nothing in some samples.
+    """A drive that exerts no force in some samples.
 
     Attributes:
-        joint: that it drives.
-        actuators: of the joint.
+        joint: name of the driven joint.
+        actuators: names of the actuators of the joint.
         is_held: whether the joint is held still, as by a brake, and not free.
-        masks: (T,) of each run, the samples.
-        costs: (2, T / every) of each run, of a drive that is on and of one that does nothing.
-        every: number of samples of which one has costs.
+        masks: inactive samples (T,) of each run.
+        costs: (2, T / every) costs in each run, of a drive that is on and of an inactive one.
+        every: interval, in samples, at which costs are computed.
     """
 
     joint: str
@@ -129,10 +129,13 @@ class InactiveDrive:
     every: int
 
     def is_likely(self, masks: Sequence[Mask]) -> bool:
-        """Whether the drive does nothing in the samples of masks (T,) of the runs, and only there.
+        """Return whether the drive is inactive in the given samples, and only there.
 
-        A drive whose commands ask for little does not tell when it is switched off: the masks may
-        cost a little more than the likeliest ones.
+        A drive with small commands does not show exactly when it is switched off, so the masks may
+        cost slightly more than the likeliest ones.
+
+        Args:
+            masks: (T,) samples of each run.
         """
         more, changes = 0.0, 0
         for costs, mask, own in zip(self.costs, masks, self.masks, strict=True):
@@ -146,13 +149,13 @@ class InactiveDrive:
 
 
 def without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Recording:
-    """Switch off or leave out what drives do nothing about, and say so in the recording's notes.
+    """Switch off inactive drives or omit these samples, and add notes to the recording.
 
-    Where a column of the recording says when a drive is off, the drive is taken to be off there;
-    else the samples are left out.
+    If a column of the recording shows when a drive is off, the drive is switched off there;
+    otherwise the samples are omitted.
 
     Args:
-        recording: as it was read, before its runs are divided.
+        recording: the recording as it was read, before its runs are divided.
         kind: a simulator of its system.
     """
     drives = inactive_drives(recording, kind)
@@ -187,7 +190,7 @@ def without_inactive_drives(recording: Recording, kind: type[Simulator]) -> Reco
 def _message(
     recording: Recording, drives: Sequence[InactiveDrive], left_out: Sequence[Mask]
 ) -> str:
-    """What is to be said of drives for whose state there is no column."""
+    """Return the note about drives whose state no column shows."""
     joints = ", ".join(drive.joint for drive in drives)
     where = spans_of_runs(recording.runs, left_out)
     noun = "joint" if len(drives) == 1 else "joints"
@@ -204,7 +207,7 @@ def _message(
 
 
 def _switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwitch]:
-    """The switches of a drive's actuators by the first column that says when it is off."""
+    """Return switches of a drive's actuators from the first column that shows when it is off."""
     for column in recording.runs[0].extra:
         for zero_is_off in (True, False):
             found = [DriveSwitch(name, column, zero_is_off) for name in drive.actuators]
@@ -214,8 +217,9 @@ def _switches(recording: Recording, drive: InactiveDrive) -> list[DriveSwitch]:
 
 
 def _changing_column(recording: Recording, drives: Sequence[InactiveDrive]) -> str:
-    """The name of the first other column that changes where drives begin or cease to do nothing,
-    and nowhere else; empty where there is none.
+    """Return the first other column that changes only where drives become inactive or active.
+
+    The result is empty if there is no such column.
     """
     for column in recording.runs[0].extra:
         hits, others = 0, 0
@@ -232,21 +236,21 @@ def _changing_column(recording: Recording, drives: Sequence[InactiveDrive]) -> s
 
 
 def _widened(mask: Mask) -> Mask:
-    """A mask with some samples more on either side."""
+    """Return a mask that is extended by some samples on either side."""
     wide: Mask = np.convolve(mask, np.ones(2 * EDGE_SAMPLES + 1), mode="same") > 0.5
     return wide
 
 
 def inactive_drives(recording: Recording, kind: type[Simulator]) -> list[InactiveDrive]:
-    """Find drives that do nothing in some samples, by (1).
+    """Find drives that are inactive in some samples, by (1).
 
     Args:
-        recording: as it was read.
+        recording: the recording as it was read.
         kind: a simulator of its system.
 
     Returns:
-        The drives; none where the positions of some joints are not recorded, where bodies float,
-        or where joints are coupled by equalities.
+        The drives; empty if the positions of some joints are not recorded, if there is a floating
+        base, or if joints are coupled by equalities.
     """
     robot = getattr(kind, "robot", None)
     if not kind.has_model or robot is None or not _is_open_chain(robot, recording):
@@ -286,7 +290,7 @@ def inactive_drives(recording: Recording, kind: type[Simulator]) -> list[Inactiv
 
 
 def _is_open_chain(robot: Robot, recording: Recording) -> bool:
-    """Whether forces follow from the recorded positions."""
+    """Return whether forces can be computed from the recorded positions."""
     recorded = recording.runs[0].channels
     singles = all(joint.single and f"q.{joint.name}" in recorded for joint in robot.joints)
     long = all(run.times.size > 3 * MIN_SAMPLES for run in recording.runs)
@@ -294,7 +298,7 @@ def _is_open_chain(robot: Robot, recording: Recording) -> bool:
 
 
 def _thinned(recording: Recording, every: int) -> list[Run]:
-    """Every k-th sample of all runs."""
+    """Return every k-th sample of all runs."""
     return [run.part(slice(None, None, every)) for run in recording.runs]
 
 
@@ -316,13 +320,13 @@ def _forces(robot: Robot, recording: Recording, run: Run) -> JointForces:
     for name, off in run.off.items():
         of = robot.actuator(name).joint
         if of is not None:
-            # Where it is known to be off, both hypotheses agree.
+            # Where the drive is known to be off, both hypotheses agree.
             driven[off, names.index(of)] = 0.0
     return JointForces(needed - applied, driven, holding - applied, motion[1])
 
 
 def _readings(robot: Robot, recording: Recording, run: Run) -> list[tuple[Array, Array]]:
-    """Recorded positions and velocities of all joints, and their noise."""
+    """Return recorded positions and velocities of all joints, and their noise."""
     readings = []
     for joint in robot.joints:
         columns, noise = [], []
@@ -338,7 +342,7 @@ def _readings(robot: Robot, recording: Recording, run: Run) -> list[tuple[Array,
 
 
 def _mean_input(run: Run, name: str) -> Array:
-    """(T,) an input about each sample: the mean of what it was until then and is from then on."""
+    """Return an input (T,) at each sample: the mean of its values before and after the sample."""
     values = run.inputs[name]
     if name in run.linear:
         return values
@@ -348,7 +352,7 @@ def _mean_input(run: Run, name: str) -> Array:
 
 
 def _controls(robot: Robot, run: Run) -> tuple[Array, Array]:
-    """Controls (T, nu) and activations (T, na) at the samples."""
+    """Return controls (T, nu) and activations (T, na) at the samples."""
     model = robot.compiled
     controls = np.zeros((run.times.size, model.nu))
     activations = np.zeros((run.times.size, model.na))
@@ -367,17 +371,17 @@ def _controls(robot: Robot, run: Run) -> tuple[Array, Array]:
 
 
 class _Stretches:
-    """Stretches of runs in which a hypothesis about some joints holds, and not that drives are on.
+    """Intervals of runs in which a hypothesis about some joints holds instead of active drives.
 
     Attributes:
         state: number of the hypothesis, ``OFF`` or ``HELD``.
-        costs: (2, T) of each run, of drives that are on and of the hypothesis.
-        masks: (T,) of each run, where it holds.
+        costs: (2, T) costs in each run, of active drives and of the hypothesis.
+        masks: (T,) samples of each run in which the hypothesis holds.
 
     Args:
-        forces: of the runs.
-        joints: numbers of the joints about which the hypothesis is.
-        state: see above.
+        forces: forces in the runs.
+        joints: indices of the joints to which the hypothesis applies.
+        state: number of the hypothesis.
     """
 
     def __init__(self, forces: Sequence[JointForces], joints: Sequence[int], state: int) -> None:
@@ -394,12 +398,13 @@ class _Stretches:
         self.masks = self._accepted(masks)
 
     def any(self) -> bool:
-        """Whether there is one."""
+        """Return whether there is an interval."""
         return any(mask.any() for mask in self.masks)
 
     def _accepted(self, masks: Sequence[Mask]) -> list[Mask]:
-        """Return masks (T,) if they fulfil the conditions above, without single stretches that do
-        not; else empty ones.
+        """Return masks (T,) if they fulfil the conditions of the module docstring, else empty ones.
+
+        Single intervals that do not fulfil them are removed.
         """
         nothing = [np.zeros_like(mask) for mask in masks]
         working = [~_widened(mask) for mask in masks]
@@ -441,14 +446,14 @@ class _Stretches:
         return zip(self._forces, masks, strict=True)
 
     def _magnitudes(self, state: int, masks: Sequence[Mask]) -> list[float]:
-        """Return how large the residuals of a hypothesis are in masks (T,), by joint."""
+        """Return the magnitude of the residuals of a hypothesis within masks (T,), by joint."""
         return [
             _magnitude(np.concatenate([r[state, m] for r, m in zip(of_runs, masks, strict=True)]))
             for of_runs in self._residuals
         ]
 
     def _is_still(self, run: int, mask: Mask, ends: tuple[int, int], fast: Sequence[float]) -> bool:
-        """Whether all joints stand still in a stretch, at an end of the run."""
+        """Return whether all joints are at rest in an interval at an end of the run."""
         velocity = self._forces[run].velocity
         at_end = ends[0] <= EDGE_SAMPLES or ends[1] >= mask.size - EDGE_SAMPLES
         still = [
@@ -459,7 +464,7 @@ class _Stretches:
 
 
 def _without_edges(mask: Mask) -> Mask:
-    """A mask without the samples beside changes, where the smoothed motion is blurred."""
+    """Return a mask without the samples near changes, where the smoothed motion is blurred."""
     result = np.zeros_like(mask)
     for first, end in spans(mask):
         result[first + EDGE_SAMPLES * (first > 0) : end - EDGE_SAMPLES * (end < mask.size)] = True
@@ -467,7 +472,7 @@ def _without_edges(mask: Mask) -> Mask:
 
 
 def _costs(residuals: Sequence[Array], state: int) -> list[Array]:
-    """Costs (2, T) of each run, of a drive that is on and of a hypothesis about one joint."""
+    """Return costs (2, T) in each run, of an active drive and of a hypothesis about one joint."""
     chosen = [ON, state]
     pooled = np.concatenate(residuals, axis=1)[chosen]
     pooled = pooled[:, np.isfinite(pooled).all(axis=0)]
@@ -486,8 +491,9 @@ def _costs(residuals: Sequence[Array], state: int) -> list[Array]:
 
 
 def _likeliest(costs: Array) -> Mask:
-    """(T,) where the second of two hypotheses is chosen, by dynamic programming over costs
-    (2, T).
+    """Return where the second of two hypotheses is chosen (T,), from costs (2, T).
+
+    Dynamic programming finds the sequence with the lowest cost.
     """
     count = costs.shape[1]
     from_other = np.zeros((2, count), dtype=bool)
@@ -506,7 +512,7 @@ def _likeliest(costs: Array) -> Mask:
 
 
 def _without_short_stretches(mask: Mask) -> Mask:
-    """A mask without stretches that are too short."""
+    """Return a mask without intervals that are too short."""
     result = np.zeros_like(mask)
     for first, end in spans(mask):
         result[first:end] = end - first >= MIN_SAMPLES
@@ -514,8 +520,9 @@ def _without_short_stretches(mask: Mask) -> Mask:
 
 
 def _magnitude(values: Array) -> float:
-    """A quantile of magnitudes (n,): impacts, of which the smoothed motion knows little, are
-    beyond it.
+    """Return a quantile of magnitudes (n,).
+
+    It excludes impacts, which the smoothed motion does not reproduce.
     """
     finite = np.abs(values[np.isfinite(values)])
     return float(np.quantile(finite, MAGNITUDE_QUANTILE)) if finite.size else 0.0

@@ -1,4 +1,4 @@
-"""Effects at the joints of a robot: which of them act where, and which are alike."""
+"""Effects at the joints of a robot: where they act, and which are equivalent."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from sims.robot.simulator import RobotSimulator
 from sims.system import members_of
 
 JOINT_MODEL = ("friction.coulomb", "drag.linear", "inertia.armature")
-"""Effects at a joint that are tried at the joint where most is missing."""
+"""Effects of the standard joint model, tried at the joint with the largest missing force."""
 SERVO_MODEL = ("actuator.stiffness", "actuator.damping")
-"""Effects at a servo that are tried at the servo of this joint."""
+"""Effects of the standard servo model, tried at the servo of the same joint."""
 MANY_SHAPES = frozenset(
     {
         "force.periodic",
@@ -28,24 +28,40 @@ MANY_SHAPES = frozenset(
         "state.limit",
     }
 )
-"""Effects that are tried at many shapes, and only where plain ones leave a force missing."""
+"""Effects with many candidate shapes, tried only if simpler effects leave a force missing."""
 OFFSET_THRESHOLD = 10.0
-"""Multiple of the noise from which a difference of positions is an offset of an encoder."""
+"""Minimum difference of positions, as a multiple of the noise, that is an encoder offset."""
 
 
 def joint_name(world: World, joint: int) -> str:
-    """Return the name of a joint by its number."""
+    """Return the name of a joint.
+
+    Args:
+        world: the runs.
+        joint: index of the joint.
+    """
     coordinate: str = world.simulator.system.coordinates[joint]
     return coordinate.removeprefix("q.")
 
 
 def servo_input(world: World, joint: int) -> str:
-    """Return the input of the position servo of a joint; empty where it has none."""
+    """Return the input of the position servo of a joint; empty if it has none.
+
+    Args:
+        world: the runs.
+        joint: index of the joint.
+    """
     return str(getattr(world.simulator.system, "servos", {}).get(joint, ""))
 
 
 def acts_at(world: World, name: str, joints: Collection[int]) -> bool:
-    """Whether an effect acts at one of some joints."""
+    """Return whether an effect acts at one of the given joints.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+        joints: indices of the joints.
+    """
     names = {joint_name(world, joint) for joint in joints}
     return any(
         member.coordinate in joints or member.signal.partition(".")[2] in names
@@ -54,7 +70,12 @@ def acts_at(world: World, name: str, joints: Collection[int]) -> bool:
 
 
 def plain_effects_beside(world: World, name: str) -> set[str]:
-    """Return the effects of the joint and servo models at the joint where an effect acts."""
+    """Return the effects of the joint and servo models at the joint where an effect acts.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
+    """
     count = len(world.simulator.system.coordinates)
     joints = {joint for joint in range(count) if acts_at(world, name, {joint})}
     return {
@@ -67,8 +88,13 @@ def plain_effects_beside(world: World, name: str) -> set[str]:
 
 
 def at_coupled_joints(world: World, name: str) -> list[str]:
-    """Return an effect's names at the other joints of its loop, where it may do the same: a filter
-    tells little of joints that are not measured.
+    """Return the names of an effect at the other joints of its kinematic loop.
+
+    It may act equivalently there, because a filter gives little information on unmeasured joints.
+
+    Args:
+        world: the runs.
+        name: name of the effect.
     """
     law, _, place = name.partition("@")
     count = len(world.simulator.system.coordinates)
@@ -84,18 +110,25 @@ def at_coupled_joints(world: World, name: str) -> list[str]:
 
 
 def has_series(world: World, names: Iterable[str]) -> bool:
-    """Whether some effects are joints in series with others, which have states of their own."""
+    """Return whether some effects are joints in series with others, which have their own states."""
     return any(is_series(world.effects[name]) for name in names)
 
 
 def has_many_shapes(name: str) -> bool:
-    """Whether an effect is one of `MANY_SHAPES`."""
+    """Return whether an effect is one of `MANY_SHAPES`."""
     return name.partition("@")[0] in MANY_SHAPES
 
 
 def offset_from_command(world: World, noise: Noise, joint: int) -> float:
-    """Return the mean difference of a joint's readings from the command of its position servo; zero
-    without a servo, or where the difference is small.
+    """Return the mean difference of a joint's readings from the command of its position servo.
+
+    Args:
+        world: the runs.
+        noise: sensor noise.
+        joint: index of the joint.
+
+    Returns:
+        The difference; zero without a servo, or if the difference is small.
     """
     system, servo = world.simulator.system, servo_input(world, joint)
     channel = system.coordinates[joint]

@@ -1,5 +1,7 @@
-"""Columns of the regressions: what effects of the library, forces of any shape and effects that are
-in the model already add to the states and readings of a filter.
+"""Columns of the regressions: inputs that effects add to the states and readings of a filter.
+
+There are columns for library effects, for forces of any shape, and for effects that are already in
+the model.
 """
 
 from __future__ import annotations
@@ -26,16 +28,16 @@ from bench.gap.prediction_error.selection import Regression
 from sims.base import Array
 
 RELATIVE_DIFFERENCE = 0.02
-"""Share of a coefficient by which it is moved for its derivative."""
+"""Finite-difference step of a coefficient, as a share of the coefficient."""
 
 
 class ModelRegression(NamedTuple):
     """A regression with effects in the model.
 
     Attributes:
-        regression: of the innovations on the candidates.
-        own: by name of each effect in the model, its columns, which are in every set; the first is
-            the whole change that it makes.
+        regression: regression of the innovations on the candidates.
+        own: columns of each effect in the model, by name, which are part of every set; the first
+            column is its whole change.
     """
 
     regression: Regression
@@ -44,7 +46,7 @@ class ModelRegression(NamedTuple):
 
 @dataclass
 class LibraryColumns:
-    """The columns of a search, about the motion that the base model's filter smooths.
+    """The columns of a search, about the smoothed motion of the base model's filter.
 
     Attributes:
         filters: the filters of the search.
@@ -75,7 +77,7 @@ class LibraryColumns:
         return self._hats
 
     def take_over(self, other: LibraryColumns) -> None:
-        """Use the columns of another search of the same runs."""
+        """Reuse the columns of another search of the same runs."""
         self._library, self._hats = other._library, other._hats
 
     def add(self, names: Sequence[str]) -> None:
@@ -88,7 +90,7 @@ class LibraryColumns:
         for name in names:
             bounds = coefficient_bounds(world, name)
             for probe in first_probes(world, base.fit, name):
-                # What the model file states may be too much.
+                # The value in the model file may be too large, so the correction may be negative.
                 signed = probe.signed or (bounds[probe.place][0] < 0 and not probe.fixed)
                 found.append(replace(probe, signed=signed))
         return found
@@ -102,21 +104,30 @@ class LibraryColumns:
         return selected
 
     def start(self, groups: Sequence[Group], coefficients: Sequence[Array]) -> Start:
-        """Return the model of a set of groups of columns, from which its fit begins."""
+        """Return a start with a set of groups of columns.
+
+        Args:
+            groups: groups of columns of the effects.
+            coefficients: coefficients of each group.
+        """
         theta, base = self.filters.reference.copy(), self.filters.models.base
         for group, own in zip(groups, coefficients, strict=True):
             theta[self.filters.world.slots[group.effect]] = self.coefficients(group, own)
         return Start(tuple(group.effect for group in groups), theta, base.fit.states)
 
     def coefficients(self, group: Group, solution: Array) -> Array:
-        """Return the coefficients (k,) of an effect that a group of columns with a solution of the
-        regression means.
+        """Return the coefficients (k,) of an effect from the regression.
+
+        Args:
+            group: columns of the effect.
+            solution: regression coefficients of these columns.
         """
         return group_coefficients(self.filters.world, self.library.probes, group, solution)
 
     def regression(self, model: Model) -> ModelRegression:
-        """Return the regression with a fitted model's effects in the model; candidates are the
-        library and forces of any shape.
+        """Return the regression with the effects of a fitted model in the filter's model.
+
+        The candidates are the library and forces of any shape.
         """
         key = model.fit.theta.tobytes()
         if key not in self._regressions:
@@ -126,8 +137,9 @@ class LibraryColumns:
         return self._regressions[key]
 
     def sensitivities(self, start: Start) -> Known:
-        """Return the derivatives of the runs by the coefficients of a model's effects about the
-        measured motion, as differences of responses.
+        """Return the derivatives of the runs by the coefficients of a model's effects.
+
+        They are differences of responses about the measured motion.
         """
         world, followed = self.filters.world, self.filters.base
         tangents = [_tangents(world, name, start.theta) for name in start.effects]
@@ -148,18 +160,17 @@ class LibraryColumns:
 def group_coefficients(
     world: World, probes: Sequence[Probe], group: Group, solution: Array
 ) -> Array:
-    """Return the coefficients (k,) of an effect that a group of columns with a solution of the
-    regression means, within their bounds.
+    """Return the coefficients (k,) of an effect from the regression, within their bounds.
 
     Args:
         world: the runs.
-        probes: of all columns.
+        probes: probes of all columns.
         group: columns of the effect.
-        solution: coefficients of these columns.
+        solution: regression coefficients of these columns.
     """
     c = probes[group.columns[0]].c.copy()
     for column, value in zip(group.columns, solution, strict=True):
-        # A fixed change is that of this very size.
+        # A fixed change is valid only at its own size.
         if not probes[column].fixed:
             c[probes[column].place] = value
     return clip_coefficients(world, group.effect, c)
@@ -171,9 +182,9 @@ def regression_about(
     """Set up the regression with effects in the model.
 
     Args:
-        current: the runs as a filter with these effects follows them.
-        columns: of the candidates.
-        followed: the runs as that filter follows them about whose motion the effects act.
+        current: the runs, filtered with these effects.
+        columns: inputs of the candidates.
+        followed: filtered runs about whose motion the effects are linearised.
     """
     own: dict[str, list[int]] = {}
     probes: list[Probe] = []
@@ -189,9 +200,7 @@ def regression_about(
 
 
 def _tangents(world: World, name: str, theta: Array) -> list[Probe]:
-    """Return the change that an effect makes with its coefficients in a model, and those with each
-    of them moved a little.
-    """
+    """Return the whole change by an effect of a model, and one with each coefficient displaced."""
     c = theta[world.slots[name]]
     probes = [Probe(name, 0, 0, c, signed=True, fixed=True)]
     for place, (low, high) in enumerate(coefficient_bounds(world, name)):

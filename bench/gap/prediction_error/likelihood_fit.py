@@ -1,12 +1,12 @@
-"""Parameters of a robot by maximum likelihood of the innovations: Gauss-Newton with step halving.
+"""Maximum likelihood estimates of robot parameters from innovations, by Gauss-Newton steps.
 
-A simulation that begins far from the right parameters leaves the data within a second, and a fit to
-it has many local minima. A filter stays near the data whatever the parameters are, so that its
-innovations are nearly linear in them (L. Ljung, System Identification, 2nd ed., 1999, chapter 10).
-Its estimates are the initial values of a fit by simulation.
+A simulation that starts far from the right parameters leaves the data within a second, and a fit to
+it has many local minima. A filter stays near the data for any parameters, so its innovations are
+nearly linear in them (L. Ljung, System Identification, 2nd ed., 1999, chapter 10). Its estimates
+are the initial values of a fit by simulation.
 
 Derivatives are differences of the innovations of whole filters. Responses about the measured
-accelerations contain the noise of the innovations that they are to explain, which biases a step.
+accelerations contain the noise of the innovations that they should explain, which biases a step.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ Follow: TypeAlias = Callable[[Array, FollowedRuns], FollowedRuns]
 ITERATIONS = 8
 """Maximum number of Gauss-Newton steps for base parameters."""
 DIFFERENCE = 1e-3
-"""Share of a parameter's plausible range by which it is moved for its derivative."""
+"""Finite-difference step of a parameter, as a share of its plausible range."""
 LEAST_GAIN = 1.0
-"""Log likelihood that a step must gain for another step to follow."""
+"""Minimum gain in log-likelihood by a step for which another step follows."""
 HALVINGS = 3
-"""Number of times a step that gains nothing is halved."""
+"""Maximum number of times that a step without gain is halved."""
 RESISTANCE = ("friction.coulomb", "drag.linear", "force.bias")
-"""Effects at a joint that are fitted beside base parameters."""
+"""Effects at a joint that are fitted together with base parameters."""
 MAX_JOINTS = 3
-"""Maximum number of joints at which they are."""
+"""Maximum number of joints at which resisting effects are fitted with base parameters."""
 RIDGE = 1e-9
 """Ridge of the normal equations, as a share of each parameter's sum of squares."""
 CLEAR = 2.0
-"""Log likelihood that base parameters must gain over the nominal ones."""
+"""Minimum gain in log-likelihood of base parameters over the nominal ones."""
 
 
 def identify_base(
@@ -49,17 +49,17 @@ def identify_base(
 ) -> tuple[FollowedRuns, dict[str, Bounds]]:
     """Identify the base parameters of a robot from the innovations of a filter.
 
-    Where they leave a force missing, friction and constant forces at the joints are fitted with
-    them and then set to zero again. Without these a mass would be estimated too large.
+    If they leave a force missing, friction and constant forces at the joints are fitted with them
+    and then set to zero again. Without these effects, a mass would be overestimated.
 
     Args:
         world: the runs for fitting; ranges that do not contain an estimate are replaced.
-        noise: of the sensors.
+        noise: sensor noise.
         followed: the runs, filtered with the nominal parameters.
 
     Returns:
-        The runs, filtered with the estimates, and the new ranges by name. The filter with nominal
-        parameters where the likelihood gains nothing or an estimate is at its widest bound.
+        The runs, filtered with the estimates, and the new ranges by name. If the likelihood gains
+        nothing or an estimate is at its widest bound, the filter with nominal parameters.
     """
 
     def follow(theta: Array, best: FollowedRuns) -> FollowedRuns:
@@ -96,7 +96,7 @@ def identify_base(
 
 
 def _resistance(followed: FollowedRuns) -> list[str]:
-    """Effects that resist the motion of the joints where most is missing."""
+    """Return effects that resist the motion of the joints with the largest missing forces."""
     world = followed.world
     coordinates = world.simulator.system.coordinates
     joints = [coordinates[j].removeprefix("q.") for j in followed.joints_by_loss[:MAX_JOINTS]]
@@ -105,7 +105,7 @@ def _resistance(followed: FollowedRuns) -> list[str]:
 
 
 def _coefficients(world: World, name: str) -> list[tuple[int, Bounds]]:
-    """Places and bounds of an effect's coefficients."""
+    """Return indices in theta and bounds of an effect's coefficients."""
     return list(zip(world.places(name), coefficient_bounds(world, name), strict=True))
 
 
@@ -120,8 +120,8 @@ def maximise_likelihood(
 
     Args:
         followed: the runs, filtered with the initial parameters.
-        places: of the parameters that are fitted.
-        bounds: of these.
+        places: indices of the fitted parameters.
+        bounds: bounds of these parameters.
         iterations: maximum number of steps.
         follow: filters the runs with other parameters; its second argument is the best filter.
 
@@ -155,12 +155,12 @@ def gauss_newton_step(
 
     Args:
         followed: the runs, filtered with the present parameters.
-        places: of the parameters that change.
-        bounds: of these; the step ends there.
+        places: indices of the parameters that change.
+        bounds: bounds of these parameters, which limit the step.
 
     Returns:
-        The change of all parameters (P,), and the log likelihood that it would gain if the
-        innovations were linear.
+        The change of all parameters (P,), and the predicted gain in log-likelihood for linear
+        innovations.
     """
     own, target = list(places), followed.filtered.whitened
     rows = np.stack(
@@ -178,7 +178,7 @@ def gauss_newton_step(
 
 
 def _derivative(followed: FollowedRuns, target: Array, place: int, bounds: Bounds) -> Array:
-    """The negative derivative (R, T, C) of the whitened innovations by a parameter."""
+    """Return the negative derivative (R, T, C) of the whitened innovations by a parameter."""
     low, high = bounds
     first, last = followed.world.parameters[place].bounds
     step = DIFFERENCE * min(last - first, high - low)

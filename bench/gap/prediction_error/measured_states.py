@@ -1,12 +1,12 @@
 """States of a robot from its recorded positions and velocities alone, without its dynamics.
 
-Each joint is filtered by itself, as a body whose jerk j is constant between samples and otherwise
+Each joint is filtered separately, as a body whose jerk j is constant between samples and otherwise
 unknown,
 
     (q, v, a)[i+1] = [[1, h, h²/2], [0, 1, h], [0, 0, 1]] (q, v, a)[i] + (h³/6, h²/2, h) j_i     (1)
 
 (Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation,
-2001, section 6.2), the size of the jerk by maximum likelihood from a grid.
+2001, section 6.2). The size of the jerk is selected from a grid by maximum likelihood.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ def measured_states(world: World, sigma: Array, run: int) -> Mapping[int, Array]
     Args:
         world: the runs.
         sigma: (C,) standard deviation of the noise of each channel.
-        run: its number.
+        run: index of the run.
 
     Returns:
-        By number of the joint, (T, 3) at the samples.
+        States (T, 3) at the samples, by index of the joint.
     """
     if run not in world.measured:
         world.measured[run] = _measured(world, sigma, run)
@@ -44,7 +44,7 @@ def measured_states(world: World, sigma: Array, run: int) -> Mapping[int, Array]
 
 
 def _measured(world: World, sigma: Array, run: int) -> Mapping[int, Array]:
-    """Estimate the states of `measured_states`."""
+    """Estimate the states for `measured_states`."""
     coordinates, rates = world.simulator.system.coordinates, world.simulator.system.rates
     track = world.tracks[run]
     times, observed = track.scenario.times, track.observed
@@ -69,12 +69,12 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     """Filter and smooth joints by (1), each with the likeliest jerk.
 
     Args:
-        times: (T,) of the samples.
-        readings: of each joint, positions and velocities (T, 2), NaN where they are missing, and
-            the standard deviations of their noise (2,).
+        times: (T,) times of the samples.
+        readings: for each joint, positions and velocities (T, 2), NaN where missing, and the
+            standard deviations of their noise (2,).
 
     Returns:
-        Of each joint, positions, velocities and accelerations (T, 3).
+        Positions, velocities and accelerations (T, 3) of each joint.
     """
     steps = np.diff(times)
     count, samples = len(readings), times.size
@@ -83,7 +83,7 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     a[:, 0, 2] = 0.5 * steps**2
     g = np.stack([steps**3 / 6.0, 0.5 * steps**2, steps], axis=1)[:, :, None]
     values = np.stack([v for v, _ in readings])
-    # Units of the noise: the two channels then share a variance of one.
+    # Use units of the noise, so that both channels have variance one.
     scale = np.stack([n for _, n in readings])[:, None]
     first = np.array([v[np.isfinite(v[:, 0]), 0][0] for v, _ in readings])
     residuals = values.copy()
@@ -97,7 +97,7 @@ def track_joints(times: Array, readings: list[tuple[Array, Array]]) -> list[Arra
     sizes = np.array(
         [max(float(np.nanmax(v[:, 0]) - np.nanmin(v[:, 0])), n[0]) for v, n in readings]
     )
-    # A range over the second, or over the time that the run takes where that is less.
+    # The scale is the range per second, or per duration of the run if that is shorter.
     span = min(float(times[-1] - times[0]), 1.0)
     prior = np.array([10.0, 10.0 / span, 100.0 / span**2]) * max(float(sizes.max()), 1e-9)
     levels = JERKS.size

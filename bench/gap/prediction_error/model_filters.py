@@ -1,8 +1,8 @@
 """Kalman filters that follow the runs with effects in the model.
 
 Regression is linear about the base model; a filter with an effect in its model is not. With the
-right effects it needs no process noise, so that its likelihood compares sets of effects before any
-of them is simulated.
+right effects it needs no process noise, so its likelihood can compare sets of effects before any of
+them is simulated.
 """
 
 from __future__ import annotations
@@ -26,17 +26,22 @@ from sims.base import Array
 from sims.robot.simulator import RobotSimulator
 
 RELINEARISATION_THRESHOLD = 100.0
-"""The model is linearised again where the smoothed motion has moved by so many times the noise."""
+"""Minimum change of the smoothed motion, in units of the noise, for another linearisation."""
 MAX_CACHED_FILTERS = 6
-"""Number of filters that are kept for effects that were tried."""
+"""Maximum number of cached filters of tried effects."""
 GAUSS_NEWTON_STEPS = 2
 """Maximum number of Gauss-Newton steps for an effect that is tried in the model."""
 SOFT_FACTORS = (0.5, 0.8, 1.2, 1.8)
-"""Multiples of the missing force that are tried as dry friction in the soft form."""
+"""Friction forces tried for dry friction in the soft form, as multiples of the missing force."""
 
 
 class FilteredSet(NamedTuple):
-    """A set of effects in the model: the runs as a filter with it follows them, and the names."""
+    """A set of effects in the model of a filter.
+
+    Attributes:
+        followed: the runs, followed by this filter.
+        names: names of the effects.
+    """
 
     followed: FollowedRuns
     names: tuple[str, ...]
@@ -47,8 +52,8 @@ class ModelFilters:
     """The filters of a search.
 
     Attributes:
-        models: the base model and the fitted ones.
-        numerics: share of the errors of the integrator's steps that the selection has in the model.
+        models: the base model and the fitted models.
+        numerics: share of the integrator's step errors that the selection puts into the model.
     """
 
     models: Scored
@@ -63,8 +68,10 @@ class ModelFilters:
 
     @cached_property
     def reference(self) -> Array:
-        """(P,) parameters without any effect: those of the base model, with free numbers as they
-        are identified beside effects. A base model without these may need absurd numbers.
+        """Parameters (P,) without any effect.
+
+        They are those of the base model, with free parameters as identified together with effects.
+        Without effects, the base model may need absurd values.
         """
         theta: Array = self.models.base.fit.theta.copy()
         identified = self.world.identified
@@ -74,14 +81,19 @@ class ModelFilters:
         return theta
 
     def theta_with(self, name: str, c: Array) -> Array:
-        """Return parameters (P,) with one effect, by its coefficients (k,)."""
+        """Return parameters (P,) with one effect.
+
+        Args:
+            name: name of the effect.
+            c: (k,) its coefficients.
+        """
         theta = self.reference.copy()
         theta[self.world.slots[name]] = c
         return theta
 
     @property
     def base(self) -> FollowedRuns:
-        """The runs as a filter follows them with the base model."""
+        """The runs, followed with the base model."""
         return FollowedRuns.of_model(self.world, self.reference, self.noise)
 
     @property
@@ -90,7 +102,7 @@ class ModelFilters:
         return FilteredSet(self.base, ())
 
     def of_model(self, model: Model) -> FollowedRuns:
-        """Return the runs as a filter follows them with a fitted model."""
+        """Return the runs, followed with a fitted model."""
         if not model.names:
             return self.base
         key = model.fit.theta.tobytes()
@@ -108,10 +120,10 @@ class ModelFilters:
         return self._of_models[key]
 
     def log_likelihood(self, theta: Array, is_soft: bool = False) -> float:
-        """Return the log likelihood of the innovations of a model.
+        """Return the log-likelihood of the innovations of a model.
 
         Args:
-            theta: (P,) its parameters.
+            theta: (P,) parameters of the model.
             is_soft: whether effects add dry friction in MuJoCo's soft form, whatever the form of
                 the search.
         """
@@ -124,11 +136,11 @@ class ModelFilters:
     def with_effects(
         self, theta: Array, names: Sequence[str], steps: int = GAUSS_NEWTON_STEPS
     ) -> FilteredSet:
-        """Follow the runs with effects in the model, whose coefficients Gauss-Newton steps improve.
+        """Follow the runs with effects in the model, and improve their coefficients.
 
         Args:
             theta: (P,) initial parameters.
-            names: the effects.
+            names: names of the effects.
             steps: maximum number of Gauss-Newton steps.
         """
         begin = self._of_tried.get(theta.tobytes()) or self._follow_near(theta, self.base)
@@ -140,16 +152,18 @@ class ModelFilters:
         return FilteredSet(best, tuple(names))
 
     def _follow_near(self, theta: Array, known: FollowedRuns) -> FollowedRuns:
-        """Follow the runs with other parameters, about a motion that is known."""
+        """Follow the runs with other parameters, linearised about a known motion."""
         followed = known.with_parameters(theta)
         moved = np.abs(followed.smoothed.states[:, :, : followed.linear[0].positions])
-        # With an encoder offset the true motion is far from the readings.
+        # With an encoder offset, the true motion is far from the readings.
         far = moved.max() > RELINEARISATION_THRESHOLD * float(np.nanmax(self.noise.sigma))
         return followed.with_parameters(theta) if far else followed
 
     def first_states(self, followed: FollowedRuns) -> Array:
-        """Return states at the first samples (R, s): of the readings, with smoothed positions
-        where an encoder is off. States of the base fit are biased by what is missing.
+        """Return states at the first samples (R, s), estimated from the readings.
+
+        With an encoder offset, positions are smoothed ones. The states of the base fit are not
+        used, because they are biased by what is missing.
         """
         states, positions = self.world.guess.copy(), followed.first_positions()
         own = states[:, : positions.shape[1]]
@@ -160,7 +174,7 @@ class ModelFilters:
         return states
 
     def penalty(self, name: str) -> float:
-        """Return what an effect must gain in twice the log likelihood."""
+        """Return the minimum gain of an effect in twice the log-likelihood."""
         count = len(self.world.places(name))
         return float(count * self.models.price + 2.0 * np.log(len(self.world.library)))
 
@@ -171,8 +185,9 @@ class ModelFilters:
 
     @cached_property
     def soft_friction(self) -> Start | None:
-        """The likeliest model of dry friction in MuJoCo's soft form at the joint where most is
-        missing, by filters; None where the library has none.
+        """The likeliest model of dry friction in MuJoCo's soft form; None if not in the library.
+
+        It acts at the joint with the largest missing force; the likelihood is that of filters.
         """
         models = soft_friction_models(self.base, self.reference)
         if not models:
@@ -183,20 +198,21 @@ class ModelFilters:
 
     @cached_property
     def _soft_simulator(self) -> RobotSimulator:
-        """The simulator with dry friction in MuJoCo's soft form."""
+        """Simulator with dry friction in MuJoCo's soft form."""
         simulator = self.world.simulator_of(soft_kind(self.world.kind))
         assert isinstance(simulator, RobotSimulator)
         return simulator
 
 
 def soft_friction_models(followed: FollowedRuns, theta: Array) -> list[tuple[str, Array]]:
-    """Return models with dry friction at the joint where most force is missing, of some sizes, that
-    a simulator with MuJoCo's soft form is to follow; none where the library has no such effect, or
-    friction is soft already.
+    """Return models with dry friction of several sizes at the joint with the largest missing force.
+
+    They are for a simulator with MuJoCo's soft form. The list is empty if the library has no such
+    effect, or if friction is already soft.
 
     Args:
         followed: the runs, without the effect.
-        theta: (P,) parameters without it.
+        theta: (P,) parameters without the effect.
 
     Returns:
         The effect and the parameters (P,) of each model.
@@ -207,7 +223,7 @@ def soft_friction_models(followed: FollowedRuns, theta: Array) -> list[tuple[str
         return []
     models = []
     for factor in SOFT_FACTORS:
-        # A joint that slides lacks about the force of its friction.
+        # The missing force of a sliding joint is about the force of its friction.
         size = np.array([factor * float(followed.force[joint])])
         changed = theta.copy()
         changed[world.slots[name]] = clip_coefficients(world, name, size)

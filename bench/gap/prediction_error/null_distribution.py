@@ -1,9 +1,10 @@
-"""Scores of candidates with what they reach by chance.
+"""Scores of candidates and their null distribution.
 
-Twice the log likelihood that k further coefficients gain where nothing is missing follows a chi
-squared distribution with k degrees of freedom (S. S. Wilks 1938, doi:10.1214/aoms/1177732360). An
-effect that is tried at n shapes takes the best of them, and the library the best of its effects;
-shapes are taken for independent, which overstates what chance reaches.
+Under the null hypothesis, twice the gain in log-likelihood by k further coefficients has a
+chi-squared distribution with k degrees of freedom (S. S. Wilks 1938, doi:10.1214/aoms/1177732360).
+The score of an effect with n shapes is the best of them, and the score of the library is the best
+of its effects. Shapes are assumed independent, which overestimates the gain under the null
+hypothesis.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ DRAWS = 200
 
 
 def p_value_of_gain(gain: float, coefficients: int, candidates: int) -> float:
-    """Return the probability that the best of some candidates gains so much by chance.
+    """Return the p-value of the largest gain among several candidates.
 
     Args:
-        gain: twice the log likelihood.
+        gain: gain in twice the log-likelihood.
         coefficients: number of coefficients of each candidate.
         candidates: number of candidates.
     """
@@ -38,9 +39,9 @@ def null_scores(
     """Score effects by a regression.
 
     Args:
-        regression: about the model that lacks them.
+        regression: regression about the model that lacks the effects.
         lacking: names of the effects to score.
-        rng: draws from the null distribution.
+        rng: random numbers for draws from the null distribution.
     """
     gains = regression.gains([])
     by_effect: dict[str, list[int]] = {}

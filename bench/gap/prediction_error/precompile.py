@@ -1,6 +1,7 @@
-"""Compile the recursions of the filter and the smoother, so that the first command need not.
+"""Compile the recursions of the filter and the smoother during installation.
 
-`make install` runs `python -m bench.gap.prediction_error.precompile`.
+The first command then need not compile them. `make install` runs `python -m
+bench.gap.prediction_error.precompile`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from bench.gap.prediction_error.state_estimation import LinearRuns, filter_runs,
 
 
 def precompile() -> None:
-    """Filter and smooth one run of two samples, for which numba compiles and keeps the code."""
+    """Filter and smooth one run of two samples, so that numba compiles and caches the code."""
     states, forces = np.ones((1, 1, 2, 2)), np.ones((1, 1, 2, 1))
     runs = LinearRuns(
         states=states,

@@ -1,7 +1,7 @@
 """Compiled recursions of the filter and the smoother, eqs. (1) to (6) of `state_estimation`.
 
-Matrices of a few joints are too small for a call of a library each: a step in Python takes fifty
-microseconds whatever their size. Compiled code is kept in the user's cache by numba.
+Matrices of a few joints are too small for one library call each: a step in Python takes fifty
+microseconds whatever their size. numba stores the compiled code in the user's cache.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from sims.base import Array
 
 
 def _compiled(function: Any) -> Any:
-    """Compile a function, and keep the code where there is a place for it.
+    """Compile a function, and cache the code if possible.
 
-    Where numba does not support this Python, the function runs as it is, a hundred times slower.
+    If numba does not support this Python version, the function runs uncompiled, a hundred times
+    slower.
     """
     if importlib.util.find_spec("numba") is None:
         return function
@@ -27,12 +28,12 @@ def _compiled(function: Any) -> Any:
     try:
         return numba.njit(cache=True, **settings)(function)
     except RuntimeError:
-        # Neither the folder of the package nor the user's cache can be written.
+        # Neither the package folder nor the user's cache is writable.
         return numba.njit(**settings)(function)
 
 
 def _product(a: Array, b: Array, out: Array) -> None:
-    """Write a b to `out`; zeros of a are skipped, since most entries of a state transition are."""
+    """Write a b to `out`; zeros of a are skipped, because most entries of a are zero."""
     for i in range(a.shape[0]):
         for j in range(b.shape[1]):
             out[i, j] = 0.0
@@ -88,16 +89,16 @@ def _filter(
         readings: H (B, T, C, Z).
         residuals: r (B, T, C).
         jumps: J (B, T - 1, Z), variances.
-        variances: of white noise (B, T, C).
+        variances: variances of white noise (B, T, C).
         prior: (Z,) standard deviations of the first states.
         deviations: (B, E) standard deviations of the missing forces.
-        largest: covariances beyond it are those of a motion that is lost.
-        predicted: (B, T, Z).
-        covariances: (B, T, Z, Z).
-        innovations: (B, T, C).
-        gains: (B, T, Z, C).
-        whiteners: (B, T, C, C).
-        likelihood: (B,).
+        largest: maximum covariance; a run with larger ones is treated as lost.
+        predicted: δ- (B, T, Z).
+        covariances: P- (B, T, Z, Z).
+        innovations: e (B, T, C).
+        gains: K (B, T, Z, C).
+        whiteners: W (B, T, C, C).
+        likelihood: log L (B,).
     """
     runs, samples, channels, size = readings.shape
     count = forces.shape[3]
@@ -199,7 +200,7 @@ def _filter(
                     if not abs(value) < largest:
                         lost = True
             if lost:
-                # Of a motion that is unstable at this rate nothing is known after the step.
+                # If the motion is unstable, the state after the step is unknown.
                 for z in range(size):
                     for y in range(size):
                         p[z, y] = prior[z] * prior[z] + 1.0 if z == y else 0.0
@@ -228,15 +229,15 @@ def _smooth(
         forces: G (B, T - 1, Z, E).
         readings: H (B, T, C, Z).
         deviations: (B, E) standard deviations of the missing forces.
-        predicted: δ- (B, T, Z), and what follows as the filter has written it.
-        covariances: (B, T, Z, Z).
-        innovations: (B, T, C).
-        gains: (B, T, Z, C).
-        whiteners: (B, T, C, C).
+        predicted: δ- (B, T, Z), as written by the filter.
+        covariances: P- (B, T, Z, Z), as written by the filter.
+        innovations: e (B, T, C), as written by the filter.
+        gains: K (B, T, Z, C), as written by the filter.
+        whiteners: W (B, T, C, C), as written by the filter.
         smoothed: δ (B, T, Z).
         missing: f (B, T - 1, E).
-        measured: (E,) the numerator of (7), to which is added.
-        expected: (E,) the denominator.
+        measured: (E,) numerator of (7), to which the runs are added.
+        expected: (E,) denominator of (7), to which the runs are added.
     """
     runs, samples, channels, size = readings.shape
     count = forces.shape[3]

@@ -1,5 +1,6 @@
-"""Sets of effects that do nearly as well as the best one, fitted by simulation: they may be
-equivalent to it, or better.
+"""Fit sets of effects that are nearly as good as the best one by simulation.
+
+They may be equivalent to it, or better.
 """
 
 from __future__ import annotations
@@ -37,18 +38,19 @@ from sims.base import Array
 MAX_RIVALS = 5
 """Maximum number of rivals of each effect that are fitted by simulation."""
 ALIKE_SHARE = 0.5
-"""Share of an effect's gain by regression that another one at the same joint must have to be
-followed in its place.
+"""Minimum gain of an effect at the same joint that is tried as a replacement.
+
+It is a share of the gain by regression of the effect that it replaces.
 """
 
 
 class _Rival(NamedTuple):
-    """An effect that may take the place of another one.
+    """An effect that may replace another one.
 
     Attributes:
         effect: its name.
-        c: (k,) its coefficients by the regression.
-        behind: by how much twice the log likelihood is lower with it.
+        c: (k,) its coefficients from the regression.
+        behind: loss in twice the log-likelihood.
     """
 
     effect: str
@@ -57,8 +59,13 @@ class _Rival(NamedTuple):
 
 
 def fit_single_in_place(context: SearchContext, best: Model) -> Model:
-    """Return the model with one effect in place of several, where that does as well: two linear
-    laws may imitate one that is not linear.
+    """Return a model with one effect in place of several if it is as good.
+
+    Two linear laws may imitate one nonlinear law.
+
+    Args:
+        context: context of the search.
+        best: the best model so far.
     """
     explained = len(best.names) > 1 and is_explained(context, best)
     if not explained or has_series(context.world, best.names) or context.world.watch.left():
@@ -76,7 +83,12 @@ def fit_single_in_place(context: SearchContext, best: Model) -> Model:
 
 
 def fit_rivals(context: SearchContext, best: Model) -> Model:
-    """Fit the sets that do nearly as well by the regression, and return the best of all."""
+    """Fit the sets that are nearly as good by the regression, and return the best of all.
+
+    Args:
+        context: context of the search.
+        best: the best model so far.
+    """
     search, world = context.search, context.world
     lost = not best.names or not np.isfinite(best.fit.cost)
     if lost or has_series(world, best.names):
@@ -93,7 +105,7 @@ def fit_rivals(context: SearchContext, best: Model) -> Model:
         search.refit(starts, race=False)
     size = len(best.names)
     if size == 1 and context.filters.base.runs.jumps.any():
-        # Fits at force limits are caught.
+        # Fits at force limits may stop in local minima.
         known = [m for m in search.models.values() if len(m.names) == 1 and m is not best]
         laws = JOINT_MODEL + SERVO_MODEL
         plain = [model for model in known if model.names[0].partition("@")[0] in laws]
@@ -105,11 +117,11 @@ def fit_rivals(context: SearchContext, best: Model) -> Model:
 
 
 def _find_rivals(context: SearchContext, model: Model, name: str) -> list[_Rival]:
-    """Return the effects that do nearly as well by the regression in the place of one."""
+    """Return the effects that are nearly as good by the regression in place of the given one."""
     world = context.world
     regression, columns = context.columns.regression(model)
     rest = regression.instead_of(columns[name])
-    # What has more coefficients gains more by chance.
+    # Effects with more coefficients gain more under the null hypothesis.
     gains = rest.net_gains()
     own = rest.gain_of(columns[name]) - context.filters.penalty(name)
     same_joint = plain_effects_beside(world, name)
@@ -133,8 +145,9 @@ def _find_rivals(context: SearchContext, model: Model, name: str) -> list[_Rival
 def _confirm_by_filter(
     context: SearchContext, best: Model, rival: _Rival, start: Start
 ) -> Start | None:
-    """Return a model with a rival in it, by a filter where it is far behind by the regression,
-    which is linear; None where the filter is far behind, too.
+    """Return a start with a rival that a filter confirms, else None.
+
+    A filter is used only if the rival is far behind by the regression, which is linear.
     """
     if rival.behind <= RIVAL_MARGIN:
         return start
@@ -147,7 +160,7 @@ def _confirm_by_filter(
 
 
 def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
-    """Fit the best models of a size with each effect at the other joints of its loop."""
+    """Fit the best models of a size with each effect moved to the other joints of its loop."""
     search, world = context.search, context.world
     starts: dict[frozenset[str], Start] = {}
     for model in _near_the_best(context, size):
@@ -163,8 +176,9 @@ def _fit_at_coupled_joints(context: SearchContext, size: int) -> None:
 
 
 def _refine_near(context: SearchContext, size: int) -> None:
-    """Fit the models of a size whose merit is near the best until nothing is left to gain, so that
-    incomplete fits do not decide between them.
+    """Fit the models of a size with nearly the best merit to convergence.
+
+    Otherwise, incomplete fits would decide between them.
     """
     search, near = context.search, _near_the_best(context, size)
     if context.world.watch.left() or len(near) < 2:
@@ -177,7 +191,7 @@ def _refine_near(context: SearchContext, size: int) -> None:
 
 
 def _near_the_best(context: SearchContext, size: int) -> list[Model]:
-    """Return the models with a number of effects whose merit is near that of the best of them."""
+    """Return the models with `size` effects whose merit is close to the highest."""
     of_size = [m for m in context.search.models.values() if len(m.names) == size]
     highest = max((model.merit for model in of_size), default=-np.inf)
     return [model for model in of_size if model.merit > highest - RIVAL_MARGIN]

@@ -1,21 +1,21 @@
 """Search for the effects that a robot's model lacks, by prediction errors.
 
-`identification` selects effects by the innovations of a filter. Here selected sets are fitted to
-whole simulated runs (output errors), which decide. The search ends as soon as a set leaves no more
-than noise. The order:
+`identification` selects effects by the innovations of a filter. Here, selected sets are fitted to
+whole simulated runs (output errors), which decide. The search ends as soon as the residual of a set
+is only noise. The order is:
 
-    1. Select effects with few shapes by regression. Fit the dry friction among them alone, since it
-       is not linear where a joint sticks (`dry_friction`), and then the set (`selected_sets`).
-    2. Where a force is still missing, fit each of the effects alone that gain most, and those of
-       the standard joint model (`single_effects`, `effect_proposals`).
+    1. Select effects with few shapes by regression. Fit the dry friction among them first, because
+       it is not linear where a joint sticks (`dry_friction`), and then the set (`selected_sets`).
+    2. If a force is still missing, fit each of the effects with the largest gains alone, and those
+       of the standard joint model (`single_effects`, `effect_proposals`).
     3. Add effects one by one, to dry friction in either of its forms or to nothing, each chosen by
        filters with the effect in the model (`forward_selection`).
     4. Select again, with effects of many shapes at the joints where a force is missing
        (`selected_sets`).
-    5. Simulate elasticity and play between a drive and its links (`single_effects`).
+    5. Simulate elasticity and backlash between a drive and its links (`single_effects`).
     6. Try one effect in place of several (`rivals`).
 
-`PredictionErrorSearch.fit_rivals` then fits the sets that do nearly as well: they may be
+`PredictionErrorSearch.fit_rivals` then fits the sets that are nearly as good, because they may be
 equivalent. All steps share filters with effects in the model (`model_filters`), columns of
 regressions (`library_columns`) and fits (`simulated_fits`).
 """
@@ -61,17 +61,16 @@ from bench.gap.prediction_error.single_effects import fit_series_effects, fit_si
 from sims.base import Array
 
 TRIED_SHARES = (1.0, 0.5)
-"""Shares of the coefficients by regression with which a filter must follow the runs better."""
+"""Shares of the regression coefficients with which a filter must follow the runs better."""
 
 
 @dataclass
 class PredictionErrorSearch(Search):
-    """A search whose candidates come from prediction errors.
+    """A search with candidates from prediction errors.
 
     Attributes:
-        is_form_given: whether the form of dry friction is not asked about before effects are
-            fitted.
-        likely: a model that is fitted before anything is selected, if there is one.
+        is_form_given: whether the form of dry friction is not tested before effects are fitted.
+        likely: a model that is fitted before any selection, if there is one.
     """
 
     is_form_given: bool = False
@@ -96,7 +95,7 @@ class PredictionErrorSearch(Search):
         return best
 
     def _find(self) -> Model:
-        """Select, fit and add effects until a set leaves no more than noise."""
+        """Select, fit and add effects until the residual of a set is only noise."""
         context = self._context
         selected = context.columns.select()
         if not self.is_form_given:
@@ -117,8 +116,10 @@ class PredictionErrorSearch(Search):
         return fit_single_in_place(context, best)
 
     def _goes_on(self, best: Model) -> bool:
-        """Whether effects that regression missed are sought: a force is missing, and there is time
-        left.
+        """Return whether to search effects that regression missed.
+
+        This is the case if a force is missing, the best model does not explain the runs, and there
+        is time left.
         """
         lacks = self._context.filters.base.lacks_force
         return lacks and not is_explained(self._context, best) and not self.world.watch.left()
@@ -127,9 +128,10 @@ class PredictionErrorSearch(Search):
         """Fit effects alone, and add effects one by one, until a set explains the runs.
 
         Args:
-            best: the best model so far; effects are added to it where it closes most of the gap.
+            best: the best model so far; effects are added to it if it removes most of the
+                discrepancy.
             selected: the selection by regression.
-            friction: its dry friction, fitted alone.
+            friction: dry friction of the selection, fitted alone.
         """
         context = self._context
         if is_nearly_explained(context, best):
@@ -144,19 +146,21 @@ class PredictionErrorSearch(Search):
         return best
 
     def fit_rivals(self, best: Model) -> Model:
-        """Fit the sets that do nearly as well, and return the best of all."""
+        """Fit the sets that are nearly as good, and return the best of all."""
         return fit_rivals(self._context, best)
 
     def take_over(self, other: PredictionErrorSearch) -> None:
-        """Use the filter and the responses of a search of the same runs with the other form of dry
-        friction, whose base model has none.
+        """Reuse the filter and the responses of a search with the other form of dry friction.
+
+        Both searches have the same runs, and the base model has no friction of that form.
         """
         self.world.followed = replace(other._context.filters.base, world=self.world)
         self._context.columns.take_over(other._context.columns)
 
     def p_value_of_missing_effect(self, model: Model) -> float:
-        """Return the p-value of the most significant effect that a fitted model lacks. Where it is
-        significant by the linear innovations, it is fitted by simulation.
+        """Return the p-value of the most significant effect that a fitted model lacks.
+
+        If it is significant by the linear innovations, it is fitted by simulation.
         """
         scores = self.scan(model)
         if scores.p_value > ALPHA or not np.isfinite(model.fit.cost):
@@ -165,7 +169,7 @@ class PredictionErrorSearch(Search):
         c = columns.coefficients(*scores.peaks[0][0])
         start = with_effect(self.world, model.fit.start(), name, c)
         places, count = self.world.places(name), len(self.world.library)
-        # A filter with the effect in the model is faster than a fit, and not linear in it.
+        # A filter with the effect in the model is faster than a fit, and not linear in the effect.
         own = filters.of_model(model).log_likelihood
         gains = []
         for share in TRIED_SHARES:
@@ -180,15 +184,21 @@ class PredictionErrorSearch(Search):
         return p_value_of_gain(gain, len(places), count)
 
     def scan(self, model: Model, against: Array | None = None) -> Scores:  # noqa: ARG002
-        """Score every effect that the model lacks by the innovations."""
+        """Score every effect that the model lacks by the innovations.
+
+        Args:
+            model: the model.
+            against: not used.
+        """
         key = frozenset(model.names)
         if key not in self.scored:
             self.enter_scores(key, self._scores(model))
         return self.scored[key]
 
     def _scores(self, model: Model) -> Scores:
+        """Score the effects by the regression about the model."""
         if has_series(self.world, model.names):
-            # The candidates are linear about the robot without further joints.
+            # The candidates are linear about the robot without additional joints.
             return replace(self.scan(self.base), p_value=1.0)
         self._look(model)
         regression, _ = self._context.columns.regression(model)
@@ -196,7 +206,7 @@ class PredictionErrorSearch(Search):
         return null_scores(regression, set(self._lacking(model)), stream)
 
     def force_of_any_shape(self, model: Model) -> tuple[float, str] | None:
-        """Return the p-value of the best force of any shape, and what it follows."""
+        """Return the p-value of the best additional force and the signal it depends on."""
         if has_series(self.world, model.names):
             return None
         columns = self._context.columns
@@ -214,8 +224,9 @@ class PredictionErrorSearch(Search):
         return replace(start, known=self._context.columns.sensitivities(start))
 
     def directions_known(self) -> tuple[Fit, Directions] | None:
-        """Return what every candidate changes about the base model's runs, to first order about the
-        measured motion.
+        """Return the first-order changes of the base model's runs by every candidate.
+
+        They are linearised about the measured motion.
         """
         library = self._context.columns.library
         values = self._context.filters.base.sensitivities(library)

@@ -1,4 +1,4 @@
-"""What the steps of a search by prediction errors share."""
+"""Shared state of the steps of a search by prediction errors."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from bench.gap.prediction_error.model_filters import ModelFilters
 
 @dataclass(frozen=True)
 class SearchContext:
-    """The state of a search.
+    """Shared state of a search.
 
     Attributes:
-        search: with the models that have been fitted by simulation.
+        search: the search, with all models fitted by simulation.
         filters: filters with effects in the model.
         columns: columns of regressions.
         proposals: effects that a set may lack.
@@ -29,7 +29,7 @@ class SearchContext:
 
     @classmethod
     def of(cls, search: Search) -> SearchContext:
-        """Return the context of a search that begins."""
+        """Create the context of a new search."""
         filters = ModelFilters(search)
         columns = LibraryColumns(filters)
         return cls(search, filters, columns, EffectProposals(filters, columns))

@@ -17,21 +17,25 @@ from sims.robot.native import FIELDS
 from sims.system import members_of
 
 MAX_SURPLUS = 2
-"""Number of selected effects that may gain too little one after another before the rest of a
-selection is left out.
-"""
+"""Maximum number of consecutive effects with too little gain before a selection is cut."""
 MAX_SLOW_EFFECTS = 2
-"""Sets of at most so many effects are fitted by simulation even where that is slow."""
+"""Maximum number of effects in a set that is fitted by simulation although this is slow."""
 LEAST_SHARE = 0.01
-"""Share of the gain of a set by which each further effect must raise it. A model of a real robot is
-never complete, and long recordings show that with certainty.
+"""Minimum gain of a further effect, as a share of the gain of the set.
+
+The model of a real robot is never complete, and long recordings show this with certainty.
 """
 
 
 def fit_quick_selection(context: SearchContext, selected: Selected) -> Model:
     """Fit the selected set by simulation, without effects that gain little.
 
-    Return the base model where that is slow and a force is missing all the same.
+    Args:
+        context: context of the search.
+        selected: the selection.
+
+    Returns:
+        The fitted model, or the base model if simulation is slow and a force is still missing.
     """
     kept = without_surplus(context, selected)
     slow = len(kept.groups) > MAX_SLOW_EFFECTS and _is_slow(context, kept)
@@ -41,7 +45,12 @@ def fit_quick_selection(context: SearchContext, selected: Selected) -> Model:
 
 
 def fit_selection(context: SearchContext, selected: Selected) -> Model:
-    """Fit the selected set by simulation, and leave out effects that do not pay there."""
+    """Fit the selected set by simulation, and drop effects that do not pay there.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
+    """
     base = context.search.base
     if not selected.groups:
         return base
@@ -57,8 +66,13 @@ def fit_selection(context: SearchContext, selected: Selected) -> Model:
 
 
 def without_surplus(context: SearchContext, selected: Selected) -> Selected:
-    """Leave out the last effects of a selection that gain little when a filter has the set in the
-    model: far from the base model a regression is wrong.
+    """Drop the last effects of a selection that gain little with the set in a filter's model.
+
+    Far from the base model, the linear regression is wrong.
+
+    Args:
+        context: context of the search.
+        selected: the selection.
     """
     filters = context.filters
     own = filters.log_likelihood(filters.reference)
@@ -79,8 +93,9 @@ def without_surplus(context: SearchContext, selected: Selected) -> Selected:
 
 
 def _is_slow(context: SearchContext, selected: Selected) -> bool:
-    """Whether a set is slow to simulate: some forces are computed in every step, or have states of
-    their own.
+    """Return whether a set is slow to simulate.
+
+    This is the case if forces are computed in every step, or have their own states.
     """
     effects = [context.world.effects[name] for name in selected.effects]
     return any(
@@ -93,7 +108,12 @@ def _is_slow(context: SearchContext, selected: Selected) -> bool:
 
 
 def select_with_shapes(context: SearchContext, selected: Selected) -> Selected:
-    """Select again with effects of many shapes, at the joints where a force is missing."""
+    """Select again with effects of many shapes, at the joints where a force is missing.
+
+    Args:
+        context: context of the search.
+        selected: the previous selection.
+    """
     world, joints = context.world, np.flatnonzero(selected.followed.missing_forces).tolist()
     rich = [n for n in world.library if has_many_shapes(n) and acts_at(world, n, joints)]
     if not rich:

@@ -1,18 +1,19 @@
 """Selection of effects by linear regression of the innovations on the candidates' responses.
 
-With e the whitened innovations of N samples and W the whitened responses of the candidates,
+With the whitened innovations e of N samples and the whitened responses W of the candidates,
 
     G = Wᵀ W,   h = Wᵀ e,   rss(S) = eᵀ e - h_Sᵀ G_SS⁻¹ h_S                                     (1)
 
-for the columns S of a set of effects. Effects are added one after another, the one first with which
-N log rss falls most, until none pays
+for the columns S of a set of effects. Effects are added one by one, first the one that decreases N
+log rss most, until none fulfils
 
     N log(rss(S) / rss(S ∪ g)) > k log N + 2 log M                                              (2)
 
-with k the number of coefficients of the effect g and M the number of candidates, by which the
-chance of the best of M is bounded (D. P. Foster, E. I. George, Ann. Stat. 22(4), 1947, 1994,
-doi:10.1214/aos/1176325766). After each addition effects that no longer pay are removed again (A.
-Miller, Subset Selection in Regression, 2nd ed., 2002, chapter 3). Nothing is simulated for it.
+with k the number of coefficients of the effect g and M the number of candidates. The last term
+bounds the gain of the best of M under the null hypothesis (D. P. Foster, E. I. George, Ann. Stat.
+22(4), 1947, 1994, doi:10.1214/aos/1176325766). After each addition, effects that no longer fulfil
+(2) are removed (A. Miller, Subset Selection in Regression, 2nd ed., 2002, chapter 3). No simulation
+is needed.
 """
 
 from __future__ import annotations
@@ -30,29 +31,29 @@ from sims.base import Array
 Places = NDArray[np.intp]
 
 ALIASED = 1e-7
-"""Share of a column's sum of squares that other columns leave, below which it is one of them."""
+"""Maximum share of a column's sum of squares that remains if it is collinear with other columns."""
 MAJORITY = 0.5
-"""Smallest share of the runs left out that a larger set must predict better."""
+"""Minimum share of the left-out runs that a larger set must predict better."""
 SHOWN = 7.0
-"""Twice the log likelihood that a column must gain to be in the data."""
+"""Minimum gain of a column in twice the log-likelihood to be visible in the data."""
 RIDGE = 1e-10
 """Ridge, as a share of each column's sum of squares."""
 SMALLEST_RSS = 1e-9
-"""Smallest residual sum of squares, as a share of the innovations'."""
+"""Minimum residual sum of squares, as a share of the sum of squares of the innovations."""
 
 
 @dataclass
 class Regression:
-    """The regression of innovations on responses.
+    """Regression of innovations on responses.
 
     Attributes:
-        groups: columns that act together, at most one of each effect in a set.
+        groups: columns that act together; a set has at most one group of each effect.
         grams: G (R, K, K) of each run.
-        crosses: h (R, K).
-        totals: eᵀ e (R,).
+        crosses: h (R, K) of each run.
+        totals: eᵀ e (R,) of each run.
         count: N.
         contains: effects that each effect contains, by name.
-        always: columns that are in every set, of no effect.
+        always: columns that are part of every set and belong to no effect.
     """
 
     groups: Sequence[Group]
@@ -71,7 +72,7 @@ class Regression:
         self._nuisance = Group("", self.always, (False,) * len(self.always))
 
     def nuisance(self, chosen: Sequence[Group]) -> float:
-        """Return the coefficient of the first column that is in every set, beside a set."""
+        """Return the coefficient of the first column of `always`, fitted together with a set."""
         _, parts = self._solve([*chosen, self._nuisance])
         return float(parts[-1][0]) if self.always else 0.0
 
@@ -79,29 +80,29 @@ class Regression:
         """Return the regression without an effect that is in the model.
 
         Args:
-            own: columns of the effect, which are in every set; the first is the whole change that
-                it makes.
+            own: columns of the effect, which are part of every set; the first one is its whole
+                change.
         """
         whole, always = own[0], tuple(c for c in self.always if c not in own)
-        # The innovations as they are without it: e + w of its whole change.
+        # Innovations without the effect: e + w of its whole change.
         crosses = self.crosses + self.grams[:, :, whole]
         totals = self.totals + 2.0 * self.crosses[:, whole] + self.grams[:, whole, whole]
         return replace(self, crosses=crosses, totals=totals, always=always)
 
     def gain_of(self, own: Sequence[int]) -> float:
-        """Return what columns gain in twice the log likelihood, whatever their signs."""
+        """Return the gain of columns in twice the log-likelihood, with any signs."""
         group = Group("", tuple(own), (False,) * len(own))
         return self.log_ratio(self.solve([])[0], self.solve([group])[0])
 
     def shows_nuisance(self, chosen: Sequence[Group]) -> bool:
-        """Whether the first column that is in every set is in the data, beside a set."""
+        """Return whether the data show the first column of `always`, in addition to a set."""
         with_it, parts = self._solve([*chosen, self._nuisance])
         rest = Group("", self.always[1:], (False,) * (len(self.always) - 1))
         without, _ = self._solve([*chosen, rest])
         return float(parts[-1][0]) > 0.5 and self.log_ratio(without, with_it) > SHOWN
 
     def solve(self, chosen: Sequence[Group]) -> tuple[float, list[Array]]:
-        """Fit a set of groups: the residual sum of squares, and the coefficients of each."""
+        """Fit a set of groups, and return the residual sum of squares and all coefficients."""
         rss, parts = self._solve([*chosen, self._nuisance])
         return rss, parts[:-1]
 
@@ -110,8 +111,8 @@ class Regression:
     ) -> tuple[float, list[Array]]:
         """Fit a set of groups.
 
-        Coefficients that must not be negative are held at zero one after another, the most
-        negative first, while any is.
+        Constrained coefficients that are negative are fixed at zero one by one, the most negative
+        first.
         """
         gram = self.gram if gram is None else gram
         cross = self.cross if cross is None else cross
@@ -132,7 +133,7 @@ class Regression:
             active[negative[np.argmin(sizes)]] = False
             solution[:] = 0.0
         explained_squares = float(solution @ cross[columns])
-        # At a solution with some coefficients held at zero the same formula holds for the others.
+        # The formula also holds for a solution with some coefficients fixed at zero.
         rss = max(self.total - explained_squares, SMALLEST_RSS * self.total)
         parts, begin = [], 0
         for group in chosen:
@@ -141,16 +142,21 @@ class Regression:
         return rss, parts
 
     def log_ratio(self, before: float, after: float) -> float:
-        """Return twice the gain of the log likelihood, N log(before / after)."""
+        """Return twice the gain in log-likelihood, N log(before / after).
+
+        Args:
+            before: residual sum of squares of the smaller set.
+            after: residual sum of squares of the larger set.
+        """
         return float(self.count * np.log(before / after))
 
     def price(self, group: Group) -> float:
-        """Return what an effect must gain, the right side of (2)."""
+        """Return the minimum gain of an effect, the right side of (2)."""
         coefficients = len(group.columns) * np.log(max(self.count, 2))
         return float(coefficients + 2.0 * np.log(max(len(self.effects), 2)))
 
     def gains(self, chosen: Sequence[Group]) -> Array:
-        """Return what each group gains beside a set, in twice the log likelihood (n,)."""
+        """Return the gain of each group in addition to a set, in twice the log-likelihood (n,)."""
         columns = columns_of(chosen)
         columns = np.append(columns, np.array(self.always, dtype=np.intp))
         gram, cross, rss = self.gram, self.cross, self.total
@@ -177,22 +183,22 @@ class Regression:
         return result
 
     def net_gains(self, chosen: Sequence[Group] = ()) -> Array:
-        """Return what each group gains beside a set, less its price (n,)."""
+        """Return the gain of each group in addition to a set, minus its price (n,)."""
         prices = np.array([self.price(group) for group in self.groups])
         net: Array = self.gains(chosen) - prices
         return net
 
     def _held(self, chosen: Sequence[Group]) -> list[str]:
-        """Effects of a set, with all that they contain."""
+        """Return the effects of a set, with all effects that they contain."""
         held = [group.effect for group in chosen]
         return held + [name for own in held for name in self.contains.get(own, ())]
 
     def select(self, most: int, begin: Sequence[Group] = ()) -> list[Group]:
-        """Select effects forward and backward by (2).
+        """Select effects by forward and backward steps with (2).
 
         Args:
             most: maximum number of effects.
-            begin: the set with which to begin.
+            begin: initial set.
         """
         chosen = list(begin)
         while len(chosen) < most:
@@ -210,9 +216,14 @@ class Regression:
         return chosen
 
     def generalises(self, smaller: Sequence[Group], larger: Sequence[Group]) -> bool:
-        """Whether a larger set predicts runs better that its coefficients were not fitted to.
+        """Return whether a larger set predicts left-out runs better.
 
-        Each run is left out in turn (M. Stone, J. R. Stat. Soc. B 36(2), 111, 1974).
+        Each run is left out in turn (cross-validation; M. Stone, J. R. Stat. Soc. B 36(2), 111,
+        1974).
+
+        Args:
+            smaller: the smaller set.
+            larger: the larger set.
         """
         if len(self.totals) < 2:
             return True
@@ -220,7 +231,7 @@ class Regression:
         return bool(after.sum() < before.sum() and (after < before).mean() >= MAJORITY)
 
     def _left_out(self, chosen: Sequence[Group]) -> Array:
-        """Return the residual sums of squares (R,) of each run, fitted to the others."""
+        """Return the residual sum of squares (R,) of each run, predicted from the others."""
         found = []
         groups = [*chosen, self._nuisance]
         columns = columns_of(groups)
@@ -233,7 +244,7 @@ class Regression:
         return np.array(found)
 
     def pruned(self, chosen: Sequence[Group]) -> list[Group]:
-        """Remove effects that do not pay by (2), the least useful first."""
+        """Remove effects that do not fulfil (2), the least useful first."""
         left = list(chosen)
         while left:
             rss, _ = self.solve(left)
@@ -250,8 +261,9 @@ class Regression:
 
 
 def _normalised(gram: Array, columns: Places) -> tuple[Array, Array]:
-    """Return the normal matrix of some columns, scaled to a diagonal of one plus the ridge, and the
-    lengths of these columns.
+    """Return the scaled normal matrix of some columns, and the lengths of these columns.
+
+    Its diagonal is one plus the ridge.
     """
     scale = np.sqrt(np.maximum(np.diagonal(gram)[columns], 1e-300))
     normal = gram[np.ix_(columns, columns)] / scale / scale[:, None]

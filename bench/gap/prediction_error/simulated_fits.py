@@ -1,7 +1,7 @@
-"""Fit sets of effects to whole simulated runs, and judge whether they explain these.
+"""Fit sets of effects to whole simulated runs, and decide whether they explain these runs.
 
-The cost of a fit is not smooth where joints stick and where servos are at force limits, so that a
-fit may be caught. It begins again from coefficients nearby.
+The cost of a fit is not smooth where joints stick and where servos are at force limits, so a fit
+may stop in a local minimum. It is restarted from nearby coefficients.
 """
 
 from __future__ import annotations
@@ -25,16 +25,22 @@ from sims.system import members_of
 NEARBY = (0.8, 0.9, 0.96, 0.98, 0.99, 1.01, 1.02, 1.04, 1.1, 1.2)
 """Factors of a coefficient at which a fit looks for a lower cost nearby."""
 EXPLAINED_EXCESS = 0.03
-"""Excess over the noise below which a fitted set explains the data."""
+"""Maximum excess over the noise of a fitted set that explains the data."""
 NEARLY_EXPLAINED = 0.1
-"""Share of the base model's excess over the noise below which effects are only added."""
+"""Maximum excess, as a share of that of the base model, at which effects are only added."""
 NEGLIGIBLE, NEGLIGIBLE_SHARE = 0.1, 0.005
-"""Excess over the noise, and share of that of the base model, below which the search ends."""
+"""Maximum excess at which the search ends: absolute, and as a share of that of the base model."""
 
 
 def fit(context: SearchContext, start: Start) -> Model:
-    """Fit a set by simulation; where that leaves much, again with derivatives by the first states
-    about the simulated motion, since those about the measured one may not hold.
+    """Fit a set by simulation.
+
+    If the residual is large, the fit is repeated with derivatives by the first states about the
+    simulated motion, because those about the measured motion may be invalid.
+
+    Args:
+        context: context of the search.
+        start: start of the fit.
     """
     search, world = context.search, context.world
     found = search.fit_one(start)
@@ -44,7 +50,7 @@ def fit(context: SearchContext, start: Start) -> Model:
     begun(world, found.fit.theta, found.fit.states, anew=True)
     found = search.fit_one(found.fit.start())
     if not is_explained(context, found):
-        # Derivatives about a wrong motion hold for no other model.
+        # Derivatives about a wrong motion are not valid for other models.
         world.derivatives = before
     for name in found.names:
         if has_dry_friction(world, [name]) and not is_explained(context, found):
@@ -53,20 +59,37 @@ def fit(context: SearchContext, start: Start) -> Model:
 
 
 def fit_filtered(context: SearchContext, current: FilteredSet) -> Model:
-    """Fit a set by simulation, from the coefficients in its filter."""
+    """Fit a set by simulation, starting from the coefficients of its filter.
+
+    Args:
+        context: context of the search.
+        current: the set.
+    """
     states = context.filters.first_states(current.followed)
     return fit(context, Start(current.names, current.followed.theta, states))
 
 
 def fit_nearby(context: SearchContext, model: Model, name: str) -> Model:
-    """Fit a model again from the best of some coefficients of an effect nearby."""
+    """Fit a model again from the best of several nearby coefficients of an effect.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+        name: name of the effect.
+    """
     ((cost, start),) = lowest_of_each(context, starts_nearby(context, model, name))
     return context.search.fit_one(start) if cost < model.fit.cost else model
 
 
 def starts_nearby(context: SearchContext, model: Model, name: str) -> list[Start]:
-    """Return starts with coefficients of an effect nearby. The runs begin where the fit has them
-    begin, or where they are measured to begin.
+    """Return starts with nearby coefficients of an effect.
+
+    Initial states are those of the fit, or those that were measured.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+        name: name of the effect.
     """
     measured = context.filters.first_states(context.filters.base)
     starts = []
@@ -79,8 +102,14 @@ def starts_nearby(context: SearchContext, model: Model, name: str) -> list[Start
 
 
 def lowest_of_each(context: SearchContext, starts: Sequence[Start]) -> list[tuple[float, Start]]:
-    """Simulate starts, and return that of lowest cost of each set of effects with its cost, the
-    lowest first.
+    """Simulate starts, and return the one with the lowest cost for each set of effects.
+
+    Args:
+        context: context of the search.
+        starts: the starts.
+
+    Returns:
+        The cost and the start for each set, in ascending order of the cost.
     """
     if not starts:
         return []
@@ -92,10 +121,15 @@ def lowest_of_each(context: SearchContext, starts: Sequence[Start]) -> list[tupl
 
 
 def is_explained(context: SearchContext, model: Model) -> bool:
-    """Whether a fitted model leaves no more than noise, or next to nothing of a large gap."""
+    """Return whether a fitted model leaves only noise, or a negligible share of a large excess.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+    """
     if is_at_noise(context, model):
         return True
-    # Friction of the other form leaves a small residual.
+    # Friction of the wrong form may leave a small residual.
     if has_dry_friction(context.world, model.names) and not context.filters.is_soft:
         return False
     excess = context.search.excess
@@ -103,23 +137,38 @@ def is_explained(context: SearchContext, model: Model) -> bool:
 
 
 def is_at_noise(context: SearchContext, model: Model) -> bool:
-    """Whether a fitted model leaves no more than noise."""
+    """Return whether a fitted model leaves only noise.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+    """
     return context.search.quiet(model) and context.search.excess(model) < EXPLAINED_EXCESS
 
 
 def is_nearly_explained(context: SearchContext, model: Model) -> bool:
-    """Whether a model closes most of the gap."""
+    """Return whether a model removes most of the discrepancy.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+    """
     excess = context.search.excess
     return excess(model) < NEARLY_EXPLAINED * excess(context.search.base)
 
 
 def higher_merit(one: Model, other: Model) -> Model:
-    """Return the model of higher merit; the first one of equals."""
+    """Return the model with the higher merit; the first one if they are equal."""
     return max(one, other, key=lambda model: model.merit)
 
 
 def without_idle_effects(context: SearchContext, model: Model) -> Model:
-    """Remove effects that do not pay, and replace a family by a member that does as well."""
+    """Remove effects that do not pay, and replace a family by a member that is as good.
+
+    Args:
+        context: context of the search.
+        model: the fitted model.
+    """
     model = _merge_into_families(context, context.search.drop(model))
     families = any(name.endswith("@*") for name in model.names)
     return context.search.plainer(model) if families else model
@@ -141,14 +190,14 @@ def _merge_into_families(context: SearchContext, model: Model) -> Model:
 
 
 def in_place_of(world: World, model: Model, names: Sequence[str], other: str, c: Array) -> Start:
-    """Return a model with one effect in the place of some, from which its fit begins.
+    """Return a start in which one effect replaces several others.
 
     Args:
         world: the runs.
         model: the fitted model.
         names: effects that are removed.
         other: the effect that replaces them.
-        c: (k,) its coefficients.
+        c: (k,) coefficients of the new effect.
     """
     theta = model.fit.theta.copy()
     for name in names:

@@ -1,7 +1,7 @@
 """Fit effects alone by simulation.
 
-A filter is linear about the measured motion, which a joint that sticks and a servo at its limit are
-not. So the effects that are most likely missing are simulated side by side.
+A filter is linear about the measured motion, but a joint that sticks and a servo at its limit are
+not linear. Therefore the effects that are most likely missing are simulated as one batch.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from bench.gap.prediction_error.simulated_fits import (
 from sims.robot.series import is_series
 
 MAX_REFINED = 3
-"""Maximum number of effects that are fitted alone until nothing is left to gain."""
+"""Maximum number of effects that are fitted alone to convergence."""
 MAX_IMPROVED_SIZE = 3
 """Maximum number of coefficients of an effect that is refined alone or improved by a filter."""
 
@@ -37,7 +37,8 @@ MAX_IMPROVED_SIZE = 3
 def fit_single_effects(context: SearchContext) -> Model:
     """Fit each of the proposed effects alone.
 
-    Return the base model where none explains the runs.
+    Returns:
+        The best model, or the base model if none explains the runs.
 
     Raises:
         SoftFrictionError: dry friction is likelier in MuJoCo's soft form.
@@ -57,11 +58,15 @@ def fit_single_effects(context: SearchContext) -> Model:
 
 
 def refine_single_effects(context: SearchContext, fitted: Sequence[Model]) -> Model:
-    """Fit some effects alone until nothing is left to gain, those of lowest cost first, and return
-    the model of highest merit.
+    """Fit some effects alone to convergence, and return the model with the highest merit.
 
-    Where joints stick and at force limits fits are caught; and likelihoods with coloured noise mean
-    little where much is left over.
+    Those with the lowest cost are fitted first. Fits may stop in local minima where joints stick
+    and at force limits, and likelihoods with coloured noise are unreliable if the residual is
+    large.
+
+    Args:
+        context: context of the search.
+        fitted: models with a single effect.
     """
     starts: list[Start] = []
     for model in fitted:
@@ -80,9 +85,13 @@ def refine_single_effects(context: SearchContext, fitted: Sequence[Model]) -> Mo
 
 
 def fit_series_effects(context: SearchContext, selected: Selected) -> Model:
-    """Fit elastic joints and play between drive and links, at the joint where most is missing.
+    """Fit elastic joints and backlash between drive and links at the most affected joint.
 
-    They have states of their own, so that each shape is simulated.
+    These effects have their own states, so each shape is simulated.
+
+    Args:
+        context: context of the search.
+        selected: the selection, whose missing forces determine the joint.
     """
     world, search = context.world, context.search
     joints = selected.followed.joints_by_loss[:1]

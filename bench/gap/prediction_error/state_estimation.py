@@ -49,38 +49,41 @@ AR_FLOOR = 1e-3
 LARGEST_CHANGE = 10.0
 """Largest factor by which an iteration of (7) changes a variance."""
 LARGEST = 1e12
-"""Derivatives and defects beyond it are those of a model that explodes, and left out."""
+"""Maximum magnitude of derivatives and defects; larger ones come from divergence.
+
+They are replaced by zero.
+"""
 LARGEST_COVARIANCE = 1e8
-"""Variances of predicted states are limited to it, in SI units squared."""
+"""Maximum variance of predicted states, in SI units squared."""
 LARGEST_LOSS = 1e30
-"""Negative log likelihood beyond which a model explodes."""
+"""Maximum negative log-likelihood of a model that does not diverge."""
 SEGMENT = 80
 """Number of samples of a segment on which the process noise is fitted."""
 ITERATIONS = 12
 """Maximum number of iterations of (7)."""
 CONVERGED = 0.15
-"""Relative change of every standard deviation below which (7) ends."""
+"""Maximum relative change of the standard deviations at which (7) has converged."""
 SMALLEST_FORCE = 1e-6
-"""Smallest standard deviation of a missing force, as a share of the typical force."""
+"""Minimum standard deviation of a missing force, as a share of the typical force."""
 STACKED = ("states", "defects", "forces", "inputs", "readings", "step_errors", "jumps")
 """Arrays of the linear models of single runs that are stacked as they are."""
 
 
 @dataclass(frozen=True)
 class LinearRuns:
-    """The linear models of R runs, padded to T samples.
+    """Linear models of R runs, padded to T samples.
 
     Attributes:
         states: A (R, T - 1, Z, Z).
         defects: d (R, T - 1, Z).
         forces: G (R, T - 1, Z, E).
-        inputs: (R, T - 1, Z, E + nu) the same of forces and controls.
+        inputs: (R, T - 1, Z, E + nu) response of the states to forces and controls.
         readings: H (R, T, C, Z).
         residuals: r (R, T, C), zero where nothing was recorded.
-        recorded: (R, T, C) where a sample was recorded.
+        recorded: (R, T, C) mask of recorded samples.
         prior: (Z,) standard deviations of the first states.
-        step_errors: (R, T - 1, Z) what the steps of the integrator miss.
-        jumps: (R, T - 1, Z) standard deviations of process noise of each state beside the forces.
+        step_errors: (R, T - 1, Z) errors of the steps of the integrator.
+        jumps: (R, T - 1, Z) standard deviations of further process noise of each state.
     """
 
     states: Array
@@ -99,7 +102,7 @@ class LinearRuns:
         return self._mapped(lambda values: values[chosen])
 
     def segments(self, length: int) -> LinearRuns:
-        """Cut the runs into segments of so many samples, each with the prior of a run."""
+        """Split the runs into segments of `length` samples, each with the prior of a run."""
         number, samples, _ = self.residuals.shape
         count = -(-samples // length)
 
@@ -107,13 +110,13 @@ class LinearRuns:
             padded = np.zeros((number, count * length, *values.shape[2:]), dtype=values.dtype)
             padded[:, : values.shape[1]] = values
             parts = padded.reshape(number * count, length, *values.shape[2:])
-            # A segment has one interval less than samples.
+            # A segment has one interval fewer than samples.
             return parts if values.shape[1] == samples else parts[:, :-1]
 
         return self._mapped(cut)
 
     def _mapped(self, change: Callable[[Any], Any]) -> LinearRuns:
-        """Return the runs with the arrays of all runs changed."""
+        """Return the runs with a function applied to the arrays of all runs."""
         names = [one.name for one in fields(self) if one.name != "prior"]
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
         return replace(self, **changed)
@@ -123,7 +126,7 @@ class LinearRuns:
         """Stack the linear models of runs.
 
         Args:
-            maps: of each run.
+            maps: linear model of each run.
             observed: (R, T, C), NaN where nothing was recorded.
             prior: (Z,) standard deviations of the first states.
         """
@@ -137,7 +140,7 @@ class LinearRuns:
                 values[:] = np.eye(prior.size)
             for run, part in enumerate(parts):
                 values[run, : len(part)] = part
-            # A step from where the model explodes tells nothing of the next one.
+            # A step in which the model diverges gives no information on the next one.
             values[~(np.abs(values) < LARGEST)] = 0.0
             stacked[name] = values
         residuals = np.zeros(observed.shape)
@@ -152,7 +155,7 @@ class LinearRuns:
 
 @dataclass(frozen=True)
 class Filtered:
-    """What the filter gives; B runs.
+    """Results of the filter for B runs.
 
     Attributes:
         predicted: δ- (B, T, Z).
@@ -160,7 +163,7 @@ class Filtered:
         innovations: e (B, T, C), zero where nothing was recorded.
         gains: K (B, T, Z, C).
         whiteners: W (B, T, C, C) with Wᵀ W = S⁻¹.
-        log_likelihood: (B,).
+        log_likelihood: log L (B,).
     """
 
     predicted: Array
@@ -176,19 +179,19 @@ class Filtered:
 
     @property
     def whitened(self) -> Array:
-        """W e (B, T, C): white with unit variance if the model is right."""
+        """Whitened innovations W e (B, T, C): white with unit variance if the model is right."""
         whitened: Array = np.einsum("btcd,btd->btc", self.whiteners, self.innovations)
         return whitened
 
 
 @dataclass(frozen=True)
 class Smoothed:
-    """What the smoother gives.
+    """Results of the smoother.
 
     Attributes:
         states: δ (B, T, Z).
         forces: f (B, T - 1, E).
-        score: (E,) the right side of (7), by which variances change.
+        score: (E,) factor of (7) by which variances change.
     """
 
     states: Array
@@ -204,8 +207,8 @@ def with_coloured_noise(runs: LinearRuns, noise: Noise) -> tuple[LinearRuns, Arr
         noise: standard deviation and correlation of each channel.
 
     Returns:
-        The models with one more state for each channel with correlated noise; and R (C,), the
-        variances of what remains white.
+        The models with one more state for each channel with correlated noise, and R (C,), the
+        variances of the remaining white noise.
     """
     coloured = np.flatnonzero(noise.phi > 0)
     white = np.square(noise.sigma)
@@ -222,7 +225,7 @@ def with_coloured_noise(runs: LinearRuns, noise: Noise) -> tuple[LinearRuns, Arr
     nothing = np.zeros((number, samples - 1, more))
     defects = np.concatenate([runs.defects, nothing], axis=2)
     jumps = np.concatenate([runs.jumps, nothing], axis=2)
-    # The innovations of the noise are driven like forces, of known variance.
+    # The innovations of the noise act like forces of known variance.
     forces = np.zeros((number, samples - 1, size + more, runs.forces.shape[3] + more))
     forces[:, :, :size, : runs.forces.shape[3]] = runs.forces
     sizes = noise.sigma[coloured] * np.sqrt(1.0 - np.square(noise.phi[coloured]))
@@ -254,7 +257,7 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
     """
     number, samples, channels = runs.residuals.shape
     size = runs.prior.size
-    # What is not recorded has a reading of zero with the variance of one.
+    # A missing sample is replaced by a reading of zero with variance one.
     variances = np.where(runs.recorded, white, 1.0)
     predicted = np.zeros((number, samples, size))
     covariances = np.zeros((number, samples, size, size))
@@ -268,13 +271,19 @@ def filter_runs(runs: LinearRuns, force: Array, white: Array) -> Filtered:
         *(_completed(force, runs), LARGEST_COVARIANCE),
         *(predicted, covariances, innovations, gains, whiteners, likelihood),
     )
-    # Of a model that explodes nothing is known, and its likelihood is zero.
+    # The likelihood of a model that diverges is set to zero.
     likelihood = np.where(likelihood > -LARGEST_LOSS, likelihood, -np.inf)
     return Filtered(predicted, covariances, innovations, gains, whiteners, likelihood)
 
 
 def smooth_runs(runs: LinearRuns, filtered: Filtered, force: Array) -> Smoothed:
-    """Smooth all runs by (5) and (6); arguments as those of `filter_runs`."""
+    """Smooth all runs by (5) and (6).
+
+    Args:
+        runs: the linear models.
+        filtered: results of the filter.
+        force: standard deviations of the missing forces, as for `filter_runs`.
+    """
     number, samples, _ = runs.residuals.shape
     count = runs.forces.shape[3]
     states = np.zeros((number, samples, runs.prior.size))
@@ -299,12 +308,15 @@ def fit_process_noise(
 
     Args:
         runs: the linear models.
-        force: (E,) where to begin.
-        white: R (C,).
-        typical: (E,) typical forces, which set the smallest deviations.
+        force: (E,) initial standard deviations.
+        white: R (C,) variances of white noise.
+        typical: (E,) typical forces, which define the minimum standard deviations.
+
+    Returns:
+        The standard deviations (E,), and the results of filter and smoother.
     """
     count = force.size
-    # Shorter segments side by side take fewer steps, and show the same process noise.
+    # Short segments in parallel need fewer steps, and show the same process noise.
     long = runs.residuals.shape[1] > 2 * SEGMENT
     short = runs.segments(SEGMENT) if long else runs
     for _ in range(ITERATIONS):
@@ -323,14 +335,12 @@ def fit_process_noise(
 
 
 def _contiguous(*arrays: Array) -> tuple[Array, ...]:
-    """Return the arrays in the one layout for which the recursions are compiled."""
+    """Return the arrays in the memory layout for which the recursions are compiled."""
     return tuple(np.ascontiguousarray(array) for array in arrays)
 
 
 def _completed(force: Array, runs: LinearRuns) -> Array:
-    """Return the deviations of all columns of G for each run (B, E), those of coloured noise
-    included.
-    """
+    """Return the deviations of all columns of G for each run (B, E), including coloured noise."""
     number, columns = len(runs.residuals), runs.forces.shape[3]
     result = np.ones((number, columns))
     result[:, : force.shape[-1]] = force
