@@ -22,7 +22,7 @@ from sims.files import require_file
 from sims.limits import LARGEST, LINE, MOST, cut
 
 if sys.version_info >= (3, 11):
-    import tomllib as tomllib  # others have it from here
+    import tomllib as tomllib  # re-exported for other modules
 else:
     import tomli as tomllib
 
