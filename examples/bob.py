@@ -1,6 +1,4 @@
-"""A weight that hangs on a spring and is pulled by an input, stepped by MuJoCo: a user's own
-simulator, whole.
-"""
+"""Complete user-defined simulator in MuJoCo: a weight on a spring, pulled by an input."""
 
 import mujoco
 

@@ -1,4 +1,4 @@
-"""A puck that slides down an inclined plane, stepped by PyBullet: a user's own simulator, whole."""
+"""Complete user-defined simulator in PyBullet: a puck that slides down an inclined plane."""
 
 import math
 
@@ -22,7 +22,7 @@ class Puck(OwnSimulator):
         box = world.createCollisionShape(world.GEOM_BOX, halfExtents=[0.05, 0.05, 0.01])
         self.puck = world.createMultiBody(self.mass, box, basePosition=[initial["x"], 0, 0.01])
         world.changeDynamics(self.puck, -1, lateralFriction=theta["friction"], linearDamping=0)
-        world.changeDynamics(self.puck, -1, localInertiaDiagonal=[0, 0, 0])  # it does not tumble
+        world.changeDynamics(self.puck, -1, localInertiaDiagonal=[0, 0, 0])  # no rotation
         world.resetBaseVelocity(self.puck, [initial["v"], 0, 0])
 
     def step(self, inputs, seconds):

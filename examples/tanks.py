@@ -1,5 +1,7 @@
-"""Two tanks, one above the other: a pump fills the upper, which drains into the lower, which drains
-away. A user's own simulator of first order, whole: it has levels, and no velocities.
+"""Complete user-defined simulator: two tanks, one above the other.
+
+A pump fills the upper tank, which drains into the lower one, which drains away. The system is of
+first order: it has levels and no velocities.
 """
 
 import math
@@ -23,13 +25,13 @@ class Tanks(OwnSimulator):
         self.theta, self.area, self.now = theta, constants["area"], dict(initial)
 
     def after(self, seconds, now, volts):
-        filled = self.theta["pump"] * volts  # and what flows out, by Torricelli's law
+        filled = self.theta["pump"] * volts  # the outflows follow Torricelli's law
         drained = self.theta["upper_outlet"] * math.sqrt(2 * 9.81 * max(now["upper"], 0.0))
         away = self.theta["lower_outlet"] * math.sqrt(2 * 9.81 * max(now["lower"], 0.0))
         gained = {"upper": filled - drained, "lower": drained - away}
         return {name: self.now[name] + gained[name] / self.area * seconds for name in gained}
 
-    def step(self, inputs, seconds):  # with the rates at its middle: levels change over minutes
+    def step(self, inputs, seconds):  # midpoint rule: levels change over minutes
         middle = self.after(seconds / 2, self.now, inputs["volts"])
         self.now = self.after(seconds, middle, inputs["volts"])
 

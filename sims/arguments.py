@@ -1,8 +1,8 @@
-"""Checks of the arguments of the public functions, made from their annotations.
+"""Check the arguments of public functions against their annotations.
 
-`check_arguments` decorates a public function. Its arguments are checked before its first line runs,
-and a wrong one is an `InputError` that names the argument, what was expected and what was found.
-Values that lower layers check, such as names of tuners, are left to these.
+`check_arguments` decorates a public function. Its arguments are checked before its body runs, and a
+wrong one raises an `InputError` that names the argument, the expected and the found value. Values
+that lower layers check, such as names of tuners, are not checked here.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Expected:
-    """What an argument is, beyond its type; stands in ``Annotated``.
+    """Restriction of an argument in addition to its type, used in ``Annotated``.
 
     Attributes:
-        words: what a message says was expected.
-        least: the lowest number that is allowed.
-        above: a number that the value must exceed.
+        words: Description of the expected value in messages.
+        least: Minimum value; None for no minimum.
+        above: Exclusive lower bound; None for none.
     """
 
     words: str
@@ -41,7 +41,7 @@ class Expected:
     above: float | None = None
 
     def allows(self, value: Any) -> bool:
-        """Whether a number is in range; whatever is no number is not looked at."""
+        """Return whether a number is in range."""
         low = self.least is None or value >= self.least
         return low and (self.above is None or value > self.above)
 
@@ -55,12 +55,12 @@ Files = Annotated[Sequence[str | Path], Expected("a path or a list of paths")]
 
 
 class _MismatchError(Exception):
-    """A value that is not what its annotation asks for.
+    """Value that does not match its annotation.
 
     Args:
-        place: the argument, and where in it, as ``effects['drag.linear']``.
-        words: what was expected.
-        value: what was found.
+        place: The argument and the position in it, as ``effects['drag.linear']``.
+        words: Description of the expected value.
+        value: Value that was found.
     """
 
     def __init__(self, place: str, words: str, value: object) -> None:
@@ -69,10 +69,11 @@ class _MismatchError(Exception):
 
 
 def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
-    """Check a function's arguments against its annotations at every call.
+    """Check a function's arguments against its annotations at each call.
 
-    A name stands for a list of one, and so does a text of names with commas between. Numbers of
-    numpy pass for Python's, and whole numbers for floats and the reverse.
+    A single name is accepted as a list of one, and a text of names with commas as a list of
+    several. NumPy numbers are accepted as Python numbers, integers as floats, and floats without
+    fraction as integers.
     """
     signature = inspect.signature(function)
 
@@ -104,10 +105,10 @@ def _bound(
     args: Sequence[object],
     kwargs: Mapping[str, object],
 ) -> inspect.BoundArguments:
-    """The arguments by name.
+    """Return the arguments by name.
 
     Raises:
-        InputError: one is unknown or missing, or there are too many.
+        InputError: An argument is unknown or missing, or there are too many.
     """
     called = function.__name__
     names = [name for name in signature.parameters if name != "self"]
@@ -129,10 +130,10 @@ def _bound(
 
 
 def _fitted(place: str, value: Any, hint: Any) -> Any:
-    """A value as its annotation asks for it.
+    """Convert a value to the type of its annotation.
 
     Raises:
-        _MismatchError: it is something else.
+        _MismatchError: The value does not match.
     """
     origin = get_origin(hint)
     if origin is Annotated:
@@ -151,11 +152,11 @@ def _fitted(place: str, value: Any, hint: Any) -> Any:
 
 
 _NOTHING = object()
-"""What stands for a value that does not fit."""
+"""Marker for a value that does not match."""
 
 
 def _expected(place: str, value: Any, hint: Any) -> Any:
-    """A value with an `Expected`, whose words replace the usual ones."""
+    """Convert a value annotated with `Expected`, whose words replace the default ones."""
     inner, expected = get_args(hint)[:2]
     try:
         fitted = _fitted(place, value, inner)
@@ -169,7 +170,7 @@ def _expected(place: str, value: Any, hint: Any) -> Any:
 
 
 def _one_of(place: str, value: Any, hint: Any) -> Any:
-    """A value of one of several types."""
+    """Convert a value to one of several types."""
     inside = []
     for kind in get_args(hint):
         try:
@@ -177,14 +178,14 @@ def _one_of(place: str, value: Any, hint: Any) -> Any:
         except _MismatchError as error:
             if error.place != place:
                 inside.append(error)
-    # For a list or dict, the entry that is wrong.
+    # For a list or dict, report the entry that is wrong.
     if len(inside) == 1:
         raise inside[0]
     raise _MismatchError(place, _words(hint), value)
 
 
 def _plain(value: Any, hint: Any, inner: tuple[Any, ...]) -> Any:
-    """A value of one type, or what stands for it; `_NOTHING` if it is neither."""
+    """Convert a value to a single type; `_NOTHING` if it does not match."""
     if hint is NoneType:
         return None if value is None else _NOTHING
     if get_origin(hint) is type:
@@ -197,7 +198,7 @@ def _plain(value: Any, hint: Any, inner: tuple[Any, ...]) -> Any:
     if hint is float:
         if not _is_number(value):
             return _NOTHING
-        # A whole number stays one: hashes of experiments contain numbers as they are written.
+        # Keep integers, because hashes of experiments contain numbers as they are written.
         return int(value) if isinstance(value, Integral) else float(value)
     if hint is Path:
         return Path(value) if isinstance(value, PathLike) else _NOTHING
@@ -213,10 +214,10 @@ def _is_whole(value: Any) -> bool:
 
 
 def _list(place: str, value: Any, hint: Any) -> Any:
-    """A list; one entry stands for a list of one."""
+    """Convert a value to a list; a single entry becomes a list of one."""
     (entry,) = get_args(hint)
     if isinstance(value, str):
-        # Paths may contain commas, names do not.
+        # Paths may contain commas, names may not.
         one = get_origin(entry) in (Union, UnionType) and Path in get_args(entry)
         parts = [value] if one else [part.strip() for part in value.split(",")]
     elif isinstance(value, Iterable) and not isinstance(value, Mapping | bytes):
@@ -239,7 +240,7 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def _dict(place: str, value: Any, hint: Any) -> Any:
-    """A dict with names as its keys."""
+    """Convert a value to a dict with texts as keys."""
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         return _NOTHING
     return {
@@ -248,7 +249,7 @@ def _dict(place: str, value: Any, hint: Any) -> Any:
 
 
 def _tuple(place: str, value: Any, hint: Any) -> Any:
-    """Convert a value to a tuple with the number of entries that the annotation has."""
+    """Convert a value to a tuple of the annotated length."""
     inner = get_args(hint)
     if not isinstance(value, list | tuple | np.ndarray) or len(value) != len(inner):
         return _NOTHING
@@ -265,7 +266,7 @@ _FITS: Mapping[Any, Callable[[str, Any, Any], Any]] = {
     tuple: _tuple,
     Callable: _function,
 }
-"""How a value of each generic type is checked, by the type's origin."""
+"""Conversion for each generic type, by the type's origin."""
 _WORDS: Mapping[Any, str] = {
     str: "text",
     int: "a whole number",
@@ -276,16 +277,16 @@ _WORDS: Mapping[Any, str] = {
     Mapping: "a dict",
     tuple: "a pair of numbers",
 }
-"""What a message calls a value of each type."""
+"""Description of each type in messages."""
 
 
 def _words(hint: Any) -> str:
-    """What a message says that an annotation asks for."""
+    """Describe in words what an annotation expects."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return str(inner[1].words)
     if origin in (Union, UnionType):
-        # A path is given as text too.
+        # Text is accepted for a path, too.
         implied = {NoneType, str} if Path in inner else {NoneType}
         return " or ".join(dict.fromkeys(_words(kind) for kind in inner if kind not in implied))
     if origin is Sequence:
@@ -299,7 +300,7 @@ def _words(hint: Any) -> str:
 
 
 def _shown(value: object) -> str:
-    """A value as a message quotes it: small ones as they are, else their type."""
+    """Format a value for a message: small ones literally, others by their type."""
     if value is None or isinstance(value, str | bool | Real | list | tuple | dict | Path):
         return cut(repr(value))
     if inspect.isclass(value):

@@ -1,8 +1,8 @@
-"""Contracts of the simulated worlds: parameters, channels, scenarios, simulators.
+"""Interfaces of simulators: parameters, channels, scenarios, simulators.
 
-Nothing in this module knows an engine. A simulator maps *parameters x scenario* to an
-*observation*; everything a tuner may change is a `Parameter`, everything the experimenter controls
-or knows is in the `Scenario`, everything the sensors give is a `Channel`. All numbers are SI.
+This module does not depend on any engine. A simulator maps *parameters x scenario* to an
+*observation*. A `Parameter` may be changed by a tuner, a `Scenario` contains what the experimenter
+controls or knows, and a `Channel` is a sensor signal. All numbers are in SI units.
 """
 
 from __future__ import annotations
@@ -21,34 +21,49 @@ Array = NDArray[np.float64]
 
 
 class InputError(ValueError):
-    """Something the user gave cannot be used; the message is one line: what was expected, found,
-    and what to do.
+    """Error in the user's input, with a one-line message.
+
+    The message states what was expected, what was found, and what to do.
     """
 
     def __init__(self, message: str) -> None:
-        # Names and cells from a user's file may hold anything; what would break the line or a
-        # terminal is escaped.
+        # Names and cells from a user's file may contain anything; escape characters that would
+        # break the line or a terminal.
         escaped = [c if c.isprintable() else ascii(c)[1:-1] for c in cut(message, MESSAGE)]
-        # Escaped it may be longer again.
+        # Escaping may make it longer again.
         super().__init__(cut("".join(escaped), MESSAGE))
 
 
 _ALIKE = 0.7
-"""Least similarity (0 to 1, `difflib`) of a name that a message proposes in place of another."""
+"""Minimum similarity (0 to 1, `difflib`) of a name that a message proposes instead of another."""
 
 
 def unknown(kind: str, name: str, known: Sequence[str]) -> InputError:
-    """The error for a name that does not exist, with the names that do and those most like it."""
+    """Make the error for an unknown name, which lists the known and the most similar names.
+
+    Args:
+        kind: Kind of the name in the message.
+        name: Unknown name.
+        known: Known names.
+    """
     listed = ", ".join(sorted(known))
     near = similar(str(name), known)
     return InputError(f"unknown {kind} '{cut(str(name))}'; there are: {listed}{near}")
 
 
 def similar(name: str, known: Iterable[str]) -> str:
-    """The end of a message about an unknown name: the names that are most like it, if any are."""
+    """Format the names most similar to an unknown name as the end of a message.
+
+    Args:
+        name: Unknown name.
+        known: Known names.
+
+    Returns:
+        A question with the similar names; empty if there are none.
+    """
     from difflib import get_close_matches
 
-    # Without case, as users write Pendulum for pendulum, and a family for one of its members.
+    # Ignore case and accept prefixes: users write Pendulum for pendulum, or a family for a member.
     names = {one.lower(): one for one in known}
     wanted = name.lower()[:QUOTED]
     begun = [one for one in names if len(wanted) >= 3 and one.startswith(wanted)]
@@ -57,7 +72,7 @@ def similar(name: str, known: Iterable[str]) -> str:
 
 
 def frozen(values: ArrayLike) -> Array:
-    """A read-only float64 copy of `values`."""
+    """Return a read-only float64 copy of `values`."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
@@ -65,17 +80,16 @@ def frozen(values: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A physical number of a simulator that a tuner may change.
+    """Physical parameter of a simulator that a tuner may change.
 
     Attributes:
-        name: the parameter's standard name, e.g. ``restitution``.
+        name: Standard name, e.g. ``restitution``.
         unit: SI unit, ``1`` for a pure number.
-        nominal: the value one would use knowing nothing of the target.
-        bounds: physically possible range; the search box of every tuner.
-        training: the part of `bounds` that learned tuners may see while training (default: all of
-            it).
-        log: whether the unit cube is logarithmic in this parameter.
-        says: one sentence a person understands.
+        nominal: Value to use without any knowledge of the target.
+        bounds: Physically possible range, which is the search range of every tuner.
+        training: Part of `bounds` that learned tuners may use in training (default: all of it).
+        log: Whether the unit cube is logarithmic in this parameter.
+        says: Description in one sentence.
     """
 
     name: str
@@ -87,7 +101,7 @@ class Parameter:
     says: str = ""
 
     def __post_init__(self) -> None:
-        # In this order: each check may take the ones before it for granted.
+        # The order matters: each check relies on the previous ones.
         low, high = self.bounds
         if not (np.isfinite([low, high]).all() and low < high):
             raise InputError(
@@ -116,7 +130,7 @@ class Parameter:
 
     @property
     def training_range(self) -> tuple[float, float]:
-        """The range learned tuners train on, in the parameter's unit."""
+        """Range on which learned tuners are trained, in the parameter's unit."""
         return self.bounds if self.training is None else self.training
 
 
@@ -125,11 +139,10 @@ class Channel:
     """One column of an observation.
 
     Attributes:
-        name: e.g. ``z``.
+        name: Name, e.g. ``z``.
         unit: SI unit.
-        scale: a typical magnitude in that unit; weighs channels against each other where no sensor
-            noise is known.
-        says: one sentence a person understands.
+        scale: Typical magnitude in that unit, which weights channels if no sensor noise is known.
+        says: Description in one sentence.
     """
 
     name: str
@@ -140,15 +153,15 @@ class Channel:
 
 @dataclass(frozen=True)
 class Constant:
-    """A number of a system that is known, not tuned.
+    """Known number of a system, which is not tuned.
 
     Attributes:
-        name: its standard name.
+        name: Standard name.
         unit: SI unit, ``1`` for a pure number.
-        value: the default.
-        says: one sentence a person understands.
-        positive: whether it must be > 0.
-        limits: the lowest and the highest value that can be meant, in its unit.
+        value: Default value.
+        says: Description in one sentence.
+        positive: Whether it must be > 0.
+        limits: Minimum and maximum plausible value, in its unit.
     """
 
     name: str
@@ -159,7 +172,7 @@ class Constant:
     limits: tuple[float, float] = (-LARGEST, LARGEST)
 
     def wanted(self, value: float) -> str:
-        """What is expected in place of `value`; empty where it can be."""
+        """Return the expected range if `value` is not possible; empty if it is possible."""
         if self.positive and value <= 0:
             return f"more than 0 {self.unit}"
         low, high = self.limits
@@ -168,21 +181,19 @@ class Constant:
 
 @dataclass(frozen=True)
 class Scenario:
-    """What the experimenter controls or knows of one run.
+    """Conditions of one run that the experimenter controls or knows.
 
     Attributes:
-        times: sample times (T,) in seconds, increasing; the state at ``times[0]`` is the initial
-            state.
-        initial: initial state by name, SI units; what is left out takes the system's default.
-        inputs: input signals by name, each (T,), held constant from one sample to the next.
-        constants: constants that differ from the simulator's own in this run.
-        linear: inputs that go straight from one sample to the next instead.
-        offset: seconds by which inputs act later than their stamps say.
-        before: inputs before the run, by name where they are known: instants in seconds from
-            ``times[0]``, negative and increasing, and values, (2, K). Else they had their first
-            value.
-        off: whether actuators of a robot are switched off, (T,) by name, held from one sample to
-            the next; what is left out is on.
+        times: (T,) sample times, increasing, s; the state at ``times[0]`` is the initial state.
+        initial: Initial state by name, SI units; the system's defaults are used for missing ones.
+        inputs: Input signals by name, each (T,), held constant between samples.
+        constants: Constants that differ from the simulator's own in this run.
+        linear: Inputs that are interpolated linearly between samples instead.
+        offset: Delay of the inputs relative to their stamps, s.
+        before: Known inputs before the run by name, (2, K): times relative to ``times[0]`` (s,
+            negative and increasing), and values. Other inputs had their first value.
+        off: Whether actuators of a robot are switched off, (T,) by name, held between samples;
+            missing actuators are on.
     """
 
     times: Array
@@ -195,7 +206,7 @@ class Scenario:
     off: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        # Copies that nobody can write to: scenarios are shared by lanes and by methods.
+        # Read-only copies, because batch elements and methods share scenarios.
         times = frozen(self.times)
         row = times.ndim == 1 and times.size > 0
         if not row or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
@@ -221,7 +232,7 @@ class Scenario:
                     f"actuator '{name}' is off in {mask.shape} samples, the scenario has "
                     f"{times.size}"
                 )
-        # The class is frozen; this is how it sets its own fields.
+        # Fields of a frozen dataclass can only be set in this way.
         object.__setattr__(self, "before", before)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "inputs", inputs)
@@ -230,14 +241,14 @@ class Scenario:
 
 
 class UnitCube:
-    """The map between physical parameters and the unit cube in which every tuner works.
+    """Map between physical parameters and the unit cube in which all tuners work.
 
     0..1 spans each parameter's `bounds`, linearly, or logarithmically for log-scaled parameters.
-    With bounds a and b, a parameter p and its place u in the cube,
+    With bounds a and b, a parameter p and its coordinate u in the cube,
 
         p = a + u (b - a),    or    p = exp(log a + u (log b - log a))     (1)
 
-    This is the only place where that map is made.
+    This class is the only implementation of the map.
     """
 
     def __init__(self, parameters: Sequence[Parameter]) -> None:
@@ -245,7 +256,7 @@ class UnitCube:
         self._log = np.array([p.log for p in self.parameters])
         self._any_log = bool(self._log.any())
         pairs = [p.bounds for p in self.parameters]
-        bounds = np.array(pairs, dtype=np.float64).reshape(-1, 2)  # also where there are none
+        bounds = np.array(pairs, dtype=np.float64).reshape(-1, 2)  # also without parameters
         self._low, self._high = self._scaled(bounds.T)
         self._span = self._high - self._low
         self.training: Array = frozen(
@@ -260,13 +271,13 @@ class UnitCube:
     def _scaled(self, theta: Array) -> Array:
         if not self._any_log:
             return theta
-        # The logarithm of 1 where none is asked for: that of a negative number warns.
+        # Use the logarithm of 1 for linear parameters, because that of a negative number warns.
         positive = np.where(self._log, theta, 1.0)
         scaled: Array = np.where(self._log, np.log(positive), theta)
         return scaled
 
     def physical(self, points: Array) -> Array:
-        """Unit-cube points (..., dim) as physical parameter vectors."""
+        """Map unit-cube points (..., dim) to physical parameter vectors."""
         scaled: Array = self._low + points * self._span  # (1)
         if not self._any_log:
             return scaled
@@ -275,33 +286,34 @@ class UnitCube:
         return mixed
 
     def inverse(self, theta: Array) -> Array:
-        """Physical parameter vectors (..., dim) as unit-cube points."""
+        """Map physical parameter vectors (..., dim) to unit-cube points."""
         result: Array = (self._scaled(np.asarray(theta, dtype=np.float64)) - self._low) / self._span
         return result
 
     def training_widths(self) -> Array:
-        """Widths (dim,) of the training ranges, in the parameters' units; `param_error` counts in
-        them.
+        """Return the widths (dim,) of the training ranges in the parameters' units.
+
+        The metric `param_error` is measured in these widths.
         """
         ranges = np.array([p.training_range for p in self.parameters], dtype=np.float64)
         return ranges[:, 1] - ranges[:, 0]
 
 
 class Simulator(ABC):
-    """Parameters x scenario -> observation, many parameter vectors at once.
+    """Map from parameters and scenario to observations, for many parameter vectors at once.
 
-    A subclass declares what it is in class attributes and implements `simulate`. The same
-    parameters and scenario must give the same observation bit for bit, whatever was simulated
-    before.
+    A subclass declares its interface in class attributes and implements `simulate`. The same
+    parameters and scenario must give the same observation bit for bit, regardless of earlier
+    simulations.
 
     Attributes:
-        parameters: what may be tuned, in the order of a parameter vector's entries.
-        channels: columns of an observation, in order.
-        constants: known numbers, with their defaults.
-        inputs: input signals a scenario may give, as channels.
-        states: initial state names with their defaults (SI).
-        requires: importable packages without which this simulator is skipped.
-        has_model: whether it comes from a robot's model file.
+        parameters: Tunable parameters, in the order of the entries of a parameter vector.
+        channels: Columns of an observation, in order.
+        constants: Known numbers, with their defaults.
+        inputs: Input signals that a scenario may contain, as channels.
+        states: Names of the initial states with their defaults (SI).
+        requires: Importable packages without which this simulator is skipped.
+        has_model: Whether it is made from a robot's model file.
     """
 
     name: ClassVar[str]
@@ -317,16 +329,16 @@ class Simulator(ABC):
     def __init__(
         self, constants: Mapping[str, float] | None = None, observe: Sequence[str] | None = None
     ) -> None:
-        """Set the constants and choose what is observed.
+        """Set the constants and select the observed channels.
 
         Args:
-            constants: values for `constants` other than their defaults.
-            observe: names of the channels to return, in this order (default: all the system has);
-                `channels` then holds these, and `columns` where they stand among the system's.
+            constants: Values of `constants` that differ from their defaults.
+            observe: Names of the channels to return, in this order (default: all of the system).
+                `channels` then contains these, and `columns` their positions among the system's
+                channels.
 
         Raises:
-            InputError: for a constant or channel the simulator does not have, or an impossible
-                value.
+            InputError: A constant or channel does not exist, or a value is impossible.
         """
         defaults = {c.name: c.value for c in self.constants}
         self.constant_values = self._constants(defaults, constants or {})
@@ -345,30 +357,36 @@ class Simulator(ABC):
 
     @abstractmethod
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
-        """Simulate each row of `theta` (n, dim), physical units; returns observations (n, T, C), SI
-        units.
+        """Simulate each parameter vector in one scenario.
 
-        A lane whose simulation fails numerically is filled with NaN; it never spoils its
-        neighbours.
+        A batch element whose simulation fails numerically is filled with NaN and does not affect
+        the others.
+
+        Args:
+            theta: Parameter vectors (n, dim), physical units.
+            scenario: Conditions of the run.
+
+        Returns:
+            Observations (n, T, C), SI units.
 
         Raises:
-            InputError: the scenario names a constant, input or initial state that the simulator
+            InputError: The scenario names a constant, input or initial state that the simulator
                 does not have.
         """
 
     def close(self) -> None:
-        """Give back what the simulator holds (engine worlds); it may be used again."""
+        """Release resources such as engine worlds; the simulator may be used again."""
 
     def run_constants(self, scenario: Scenario) -> dict[str, float]:
-        """The constants of one run: the simulator's, overridden by the scenario's."""
+        """Return the constants of one run: the simulator's, overridden by the scenario's."""
         return self._constants(self.constant_values, scenario.constants)
 
     def run_initial(self, scenario: Scenario) -> dict[str, float]:
-        """The initial state of one run: the system's defaults, overridden by the scenario's."""
+        """Return the initial state of one run: the defaults, overridden by the scenario's."""
         return self._checked("initial state", self.states, scenario.initial)
 
     def run_inputs(self, scenario: Scenario) -> dict[str, Array]:
-        """The input signals of one run, each (T,); what the scenario leaves out is zero."""
+        """Return the input signals of one run, each (T,); missing inputs are zero."""
         known = {c.name: np.zeros(scenario.times.size) for c in self.inputs}
         return self._checked("input", known, scenario.inputs)
 
@@ -403,11 +421,17 @@ class Simulator(ABC):
 def adjusted(
     parameters: Sequence[Parameter], changes: Mapping[str, Mapping[str, Any]]
 ) -> tuple[Parameter, ...]:
-    """`parameters` with some attributes replaced by an experiment's: ``{"restitution": {"training":
-    (0.3, 0.7)}}``.
+    """Replace attributes of parameters as an experiment states.
+
+    Args:
+        parameters: Parameters of a simulator.
+        changes: New attributes by parameter, such as ``{"restitution": {"training": (0.3, 0.7)}}``.
+
+    Returns:
+        The changed parameters.
 
     Raises:
-        InputError: unknown parameter or attribute name.
+        InputError: A parameter or attribute is unknown, or a value is not possible.
     """
     names = [p.name for p in parameters]
     allowed = ("nominal", "bounds", "training", "log")
@@ -417,13 +441,13 @@ def adjusted(
         for attribute in change:
             if attribute not in allowed:
                 raise unknown(f"attribute of parameter {name}", attribute, allowed)
-    pairs = ("bounds", "training")  # lists in an experiment's file
+    pairs = ("bounds", "training")  # given as lists in an experiment's file
     result = []
     for p in parameters:
         change = changes.get(p.name, {})
         new: dict[str, Any] = {k: tuple(v) if k in pairs else v for k, v in change.items()}
-        changed = replace(p, **new)  # which checks the parameter anew
-        # What is positive by its nature, as a mass, is so whatever an experiment makes of it.
+        changed = replace(p, **new)  # this also checks the new parameter
+        # Parameters that are positive by nature, such as masses, must stay positive.
         low, lowest = p.bounds[0], changed.bounds[0]
         if low >= 0 and (lowest < 0 or (low > 0 and lowest == 0)):
             wanted = "more than 0" if low > 0 else "at least 0"

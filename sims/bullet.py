@@ -1,6 +1,6 @@
-"""What every world in Bullet shares: the engine itself, the life of a world, a body on a joint.
+"""PyBullet connection: importing the engine, lifetime of a world, a body on a joint.
 
-Bullet is reached through PyBullet, in this process and without a window.
+PyBullet runs in this process and without a window.
 """
 
 from __future__ import annotations
@@ -14,14 +14,12 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 NO_LIMIT = 1e100
-"""m/s or rad/s: Bullet clips speeds, by default at 100."""
+"""Speed limit in m/s or rad/s that has no effect; by default Bullet clips speeds at 100."""
 
 
 @functools.cache
 def engine() -> Any:
-    """The module ``pybullet``, imported on first use: it takes a while and most commands never
-    simulate.
-    """
+    """Import the module ``pybullet`` on first use, because most commands never simulate."""
     with _output_discarded():
         import pybullet
     return pybullet
@@ -29,34 +27,33 @@ def engine() -> Any:
 
 @contextlib.contextmanager
 def _output_discarded() -> Iterator[None]:
-    """Discard what C code prints (PyBullet says when it was built), so that the output is ours
-    alone.
-    """
-    # PyBullet prints from C, past Python's `sys.stdout`, so the file descriptors are turned.
+    """Discard the output of C code, such as PyBullet's build date."""
+    # PyBullet prints from C and bypasses `sys.stdout`, so redirect the file descriptors.
     flush = ctypes.CDLL(None).fflush if os.name == "posix" else lambda _: None
-    flush(None)  # what others printed before is theirs to keep
+    flush(None)  # keep earlier output of others
     with contextlib.ExitStack() as undo:
         for stream in (1, 2):
-            with contextlib.suppress(OSError):  # a process may have no such stream
+            with contextlib.suppress(OSError):  # a process may lack this stream
                 kept = os.dup(stream)
                 undo.callback(os.close, kept)
                 undo.callback(os.dup2, kept, stream)
                 sink = os.open(os.devnull, os.O_WRONLY)
                 undo.callback(os.close, sink)
                 os.dup2(sink, stream)
-        undo.callback(flush, None)  # C has a buffer of its own, which would come out later
+        undo.callback(flush, None)  # C has its own buffer, which would be printed later
         yield
 
 
 class PersistentWorld:
-    """One Bullet world: connected when first needed, kept from rollout to rollout, closed with its
-    owner.
+    """Bullet world that is connected when first needed and reused until its owner is closed.
 
     Building a world costs as much as simulating a hundred samples, so it is built once for each set
-    of constants; the owner must start every rollout by setting all that a rollout may have changed.
+    of constants. At the start of each rollout, the owner must reset everything that a rollout may
+    have changed.
 
     Args:
-        build: called with (client, constants) on an empty world; returns the moving body's id.
+        build: Function called with (client, constants) on an empty world; returns the id of the
+            moving body.
     """
 
     def __init__(self, build: Callable[[int, Mapping[str, float]], int]) -> None:
@@ -69,16 +66,16 @@ class PersistentWorld:
     def __reduce__(
         self,
     ) -> tuple[type[PersistentWorld], tuple[Callable[[int, Mapping[str, float]], int]]]:
-        # A copy of a simulator, here or in another process, gets a world of its own.
+        # A copy of a simulator, also in another process, gets its own world.
         return PersistentWorld, (self._build,)
 
     def body(self, constants: Mapping[str, float]) -> tuple[int, int]:
-        """The ids (client, body) of a world with these constants."""
+        """Return the ids (client, body) of a world with these constants."""
         if self._disconnect is None:
             self._client = engine().connect(engine().DIRECT)
             self._disconnect = weakref.finalize(self, engine().disconnect, self._client)
         if self._built_for != constants:
-            # Before the building, which may fail half way.
+            # Invalidate first, because building may fail half way.
             self.discard()
             engine().resetSimulation(physicsClientId=self._client)
             self._body = self._build(self._client, constants)
@@ -86,13 +83,14 @@ class PersistentWorld:
         return self._client, self._body
 
     def discard(self) -> None:
-        """Build afresh before the next rollout: this world is in a state that resetting bodies
-        cannot undo.
+        """Have the world built again before the next rollout.
+
+        Used when the world is in a state that resetting its bodies cannot restore.
         """
         self._built_for = None
 
     def close(self) -> None:
-        """Disconnect; harmless when there is nothing to disconnect."""
+        """Disconnect the world if it is connected."""
         if self._disconnect is not None:
             self._disconnect()
         self._disconnect = None
@@ -106,15 +104,17 @@ def joint(
     mass: float,
     centre: tuple[float, float, float],
 ) -> int:
-    """A body on one joint that is fixed to the world and resists nothing; returns the body's id,
-    the joint being 0.
+    """Create a body on one joint without friction that is fixed to the world.
 
     Args:
-        client: the world.
+        client: Id of the world.
         kind: ``JOINT_REVOLUTE`` or ``JOINT_PRISMATIC``, at the origin.
-        axis: of the joint.
-        mass: kg.
-        centre: of mass, where the joint's position is 0.
+        axis: Axis of the joint.
+        mass: Mass of the body, kg.
+        centre: Centre of mass at joint position 0, m.
+
+    Returns:
+        The id of the body, whose joint has the index 0.
     """
     p = engine()
     body: int = p.createMultiBody(
@@ -130,8 +130,8 @@ def joint(
         linkJointAxis=[axis],
         physicsClientId=client,
     )
-    # By default Bullet adds air resistance, sleep when nothing moves, a speed limit of 100, and a
-    # motor that brakes the joint.
+    # By default Bullet adds air resistance, sleeping, a speed limit of 100, and a motor that brakes
+    # the joint.
     p.changeDynamics(
         body,
         -1,
@@ -141,6 +141,6 @@ def joint(
         maxJointVelocity=NO_LIMIT,
         physicsClientId=client,
     )
-    # A motor without force in place of the one that every joint begins with.
+    # Replace the default motor of the joint by one without force.
     p.setJointMotorControl2(body, 0, p.VELOCITY_CONTROL, force=0.0, physicsClientId=client)
     return body

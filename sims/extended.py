@@ -1,9 +1,9 @@
-"""Extended simulators on disk: `extended.toml` is written by explain and loads back as a simulator
-like any other.
+"""Extended simulators: write and load `extended.toml`.
 
-The file names the system, the effects and every number with its interval. Loaded, it is a
-registered simulator whose nominal values are the fitted ones, so `compare`, `simulate` and every
-tuner take it. That of a robot names its model file in place of a system.
+The file is written by explain and names the system, the effects and every number with its interval;
+for a robot it names the model file instead of a system. When it is loaded, it is a registered
+simulator whose nominal values are the fitted ones, so that `compare`, `simulate` and every tuner
+accept it.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from sims.simulated import Simulated, effect_parameters
 from sims.user_toml import fault, finite, known, names, read_toml, table, text
 
 FORMAT = 1
-"""Of the file; a reader refuses any other."""
+"""Version of the file format; files with another version are refused."""
 
 SPREAD = 0.2
-"""The training range of a fitted number reaches at least this share of it to either side."""
+"""Minimum half width of the training range of a fitted number, as a fraction of the number."""
 
 WIDTHS = 3.0
-"""It reaches at least this many half widths of the number's interval to either side."""
+"""Minimum half width of the training range, in half widths of the number's interval."""
 
 LONGEST = 40
-"""Characters of a system's name in that of its extension."""
+"""Maximum number of characters of the system's name in the name of its extension."""
 
 _SMALLEST = 1e-12
-"""It reaches at least this far, in the number's unit, or it would be empty about 0."""
+"""Minimum half width of the training range in the number's unit; otherwise it is empty about 0."""
 
 _KEYS = (
     "format",
@@ -50,24 +50,25 @@ _KEYS = (
     "effects",
     *stored.KEYS,
 )
-"""What may stand in the file."""
+"""Keys allowed in the file."""
 
 
 @dataclass(frozen=True)
 class Number:
-    """A fitted number with its 95 % interval, None where the data do not bound it.
+    """Fitted number with its 95 % interval, which is None where the data do not bound it.
 
     Attributes:
-        value: the estimate.
-        unit: of the estimate and its interval.
-        low, high: the 95 % interval.
-        at_bound: which end of its range the estimate lies at; None where it lies inside. At a bound
-            there is no interval.
-        stated: the number of the robot's model file that the estimate changes; None where the file
-            has no such number.
-        total: the same with the estimate in it.
-        total_unit: unit of `stated` and `total`; empty where it is `unit`.
-        usual_range: the range in which one expects the estimate; None where it lies inside.
+        value: Estimate.
+        unit: Unit of the estimate and its interval.
+        low: Lower end of the 95 % interval.
+        high: Upper end of the 95 % interval.
+        at_bound: End of the range at which the estimate is; None inside the range. At a bound there
+            is no interval.
+        stated: Number of the robot's model file that the estimate changes; None if the file has no
+            such number.
+        total: Value of that number with the estimate applied.
+        total_unit: Unit of `stated` and `total`; empty if it is `unit`.
+        usual_range: Expected range of the estimate; None if the estimate is inside it.
     """
 
     value: float
@@ -82,15 +83,17 @@ class Number:
 
     @property
     def is_result(self) -> bool:
-        """Whether the data determine the number: it has an interval, or is zero where nothing less
-        is possible, such as a friction that does not exist.
+        """Whether the data determine the number.
+
+        This is the case if it has an interval, or if it is zero at its lower bound, such as the
+        coefficient of a friction that does not exist.
         """
         if self.at_bound is not None:
             return self.at_bound == "low" and self.value == 0.0
         return self.low is not None and self.high is not None
 
     def table(self) -> dict[str, Any]:
-        """As TOML, which has no null."""
+        """Return the number as a TOML table, which has no null."""
         stated: dict[str, Any] = {"value": self.value, "unit": self.unit}
         if self.low is not None and self.high is not None:
             stated |= {"low": self.low, "high": self.high}
@@ -99,20 +102,20 @@ class Number:
 
 @dataclass(frozen=True)
 class Extended:
-    """An extended simulator.
+    """Extended simulator.
 
     Attributes:
-        name: under which it registers.
-        system: the system's registered name, or that of the robot.
-        engine: the engine it was fitted with; None for a simulator that steps itself.
-        title: of the recording that it was fitted to.
-        parameters: the system's own.
-        effects: coefficients by effect, in the order in which a signal passes them.
-        constants: as the recording states them, and fitted ones.
-        observe: channels that the recording had.
-        kind: the simulator's class of its system, where it is known: what `opened` and explain give
-            knows it.
-        robot: the model file and what was added to it, where it is of a robot.
+        name: Name under which it is registered.
+        system: Registered name of the system, or name of the robot.
+        engine: Engine with which it was fitted; None for a user-defined simulator, which steps
+            itself.
+        title: Title of the recording to which it was fitted.
+        parameters: Fitted parameters of the system itself.
+        effects: Coefficients by effect, in the order in which a signal passes the effects.
+        constants: Constants stated by the recording, and fitted ones.
+        observe: Channels of the recording.
+        kind: Simulator class of the system, if it is known, as after `opened` and explain.
+        robot: Model file and additions to it, if the system is a robot.
     """
 
     name: str
@@ -123,16 +126,17 @@ class Extended:
     effects: Mapping[str, Mapping[str, Number]]
     constants: Mapping[str, float]
     observe: Sequence[str]
-    # No part of what was fitted: a file names the system, and whoever reads it knows the class.
+    # Not compared: it is not part of the fit, and the file contains only the system's name.
     kind: type[Simulated] | None = field(default=None, compare=False, repr=False)
     robot: StoredRobot | None = None
 
     def simulator(self) -> Simulated:
-        """The fitted simulator, ready to simulate: its parameters' nominal values are the fitted
-        ones.
+        """Return the fitted simulator, ready to use.
+
+        The nominal values of its parameters are the fitted ones.
 
         Raises:
-            InputError: the class of its system is not known.
+            InputError: The simulator class of the system is unknown.
         """
         if self.kind is None:
             remedy = "open its file with sims.extended.opened, or use simulator_of"
@@ -141,28 +145,33 @@ class Extended:
 
 
 def name_of(system: str) -> str:
-    """The name of what extends a system; that of a robot is its file's, which may hold anything."""
+    """Return the name of the extension of a system; special characters are replaced."""
     plain = re.sub(r"[^A-Za-z0-9_.-]", "_", system)[:LONGEST]
     return f"{plain if plain[:1].isalpha() else f'robot_{plain}'}_extended"
 
 
 def robot_of(kind: type[Simulated]) -> StoredRobot | None:
-    """What a file names of the robot that a simulator is of; None where it is of a system."""
+    """Return the robot data that a file contains for a simulator; None if it is not a robot."""
     robot: Any = kind
     return stored.of(robot) if kind.has_model else None
 
 
 def write(extended: Extended, path: Path) -> None:
-    """Write the file."""
+    """Write an extended simulator to a file.
+
+    Args:
+        extended: Extended simulator.
+        path: Path of the file.
+    """
     files.write(path, written(extended, path.parent))
 
 
 def written(extended: Extended, folder: Path | None = None) -> str:
-    """The content of the file.
+    """Format the content of the file.
 
     Args:
-        extended: what was found.
-        folder: in which it will lie: from there a robot's model file is named.
+        extended: Extended simulator.
+        folder: Folder of the file, to which the path of a robot's model file is relative.
     """
     import tomli_w
 
@@ -191,7 +200,7 @@ def read(path: Path) -> Extended:
     """Read and check a file.
 
     Raises:
-        InputError: it is missing, malformed, or of another format.
+        InputError: The file is missing, malformed, or has another format.
     """
     document = read_toml(path)
     if document.get("format") != FORMAT:
@@ -215,7 +224,7 @@ def read(path: Path) -> Extended:
 
 
 def _system(path: Path, document: Mapping[str, Any]) -> tuple[str, str | None]:
-    """The registered system, and the engine that steps it, if that was chosen."""
+    """Return the name of the registered system, and of the engine if the file states one."""
     for key in document:
         if key in stored.KEYS and key != "engine":
             raise InputError(f"{path}: {key} is for a robot; expected model too, found none")
@@ -224,7 +233,7 @@ def _system(path: Path, document: Mapping[str, Any]) -> tuple[str, str | None]:
 
 
 def _name(path: Path, value: Any) -> str:
-    """The name under which it registers; a class, a folder and a file are called after it."""
+    """Check the name under which the simulator is registered; it is also used for files."""
     name = _text(path, "name", value)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]*", name):
         raise fault(path, "name", "letters, digits, '_', '.' and '-'", name)
@@ -246,7 +255,7 @@ def _constants(path: Path, value: Any) -> dict[str, float]:
 
 def _effects(path: Path, value: Any) -> dict[str, dict[str, Number]]:
     coefficients = {}
-    # Their order is kept: a signal passes them one after another.
+    # The order matters: a signal passes the effects one after another.
     for name, numbers in table(path, "effects", value).items():
         table(path, name, numbers)
         coefficients[name] = _numbers(path, f"effects.{name}", numbers)
@@ -280,21 +289,22 @@ def _real(path: Path, where: str, value: Any) -> float:
 
 
 def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
-    """The extended simulator as a class that registers like any other; made without arguments it is
-    the fitted one.
+    """Make the extended simulator as a class that can be registered.
+
+    An instance made without arguments is the fitted simulator.
 
     Args:
-        extended: what was read.
-        kind: the simulator's class of its system.
+        extended: Content of the file.
+        kind: Simulator class of the system.
 
     Raises:
-        InputError: a parameter, effect, coefficient, constant or channel that does not exist.
+        InputError: A parameter, effect, coefficient, constant or channel does not exist.
     """
     known(f"parameter of system {extended.system}", extended.parameters, _names(kind))
     fitted = extended.parameters
     own = [_at(p, fitted[p.name]) if p.name in fitted else p for p in kind.parameters]
     values = _coefficients(extended, kind)
-    # Made once, so that whatever it refuses is refused here; it knows the coefficients' bounds.
+    # Make one instance, so that wrong settings are refused here; it knows the coefficients' bounds.
     effects, observed = list(extended.effects), list(extended.observe)
     fresh = kind(extended.constants, observed, effects=effects, **_engine(extended))
     added = [_at(p, n) for p, n in zip(fresh.parameters[len(own) :], values, strict=True)]
@@ -303,14 +313,14 @@ def simulator_of(extended: Extended, kind: type[Simulated]) -> type[Simulated]:
 
 
 def _engine(extended: Extended) -> dict[str, Any]:
-    """The setting that chooses the engine; a simulator that steps itself has no such setting."""
+    """Return the setting that selects the engine; user-defined simulators have none."""
     return {"engine": extended.engine} if extended.engine else {}
 
 
 def _class_of(
     extended: Extended, kind: type[Simulated], parameters: tuple[Parameter, ...]
 ) -> type[Simulated]:
-    """A class of `kind` with everything that was fitted for its defaults."""
+    """Make a subclass of `kind` with all fitted values as defaults."""
     effects, observed = list(extended.effects), list(extended.observe)
 
     def __init__(  # noqa: N807
@@ -319,25 +329,26 @@ def _class_of(
         observe: Sequence[str] | None = None,
         **settings: Any,
     ) -> None:
-        # Engine, sensors and constants may be chosen anew; the effects are what was found.
+        # Engine, sensors and constants may be changed; the effects are fixed.
         stated = {**extended.constants, **(constants or {})}
         chosen = {**_engine(extended), **settings}
         kind.__init__(self, stated, observe or observed, effects=effects, **chosen)
-        # An own simulator refuses to have it set twice, as its author might by accident.
+        # A user-defined simulator refuses to set this attribute twice, so bypass the check.
         object.__setattr__(self, "parameters", parameters)
 
     body = {
         "__init__": __init__,
         "system": kind.system,
         "extends": extended.system,
-        # All such classes come from this one text and may have one name: their numbers tell them
-        # apart, or a tuner trained in the one would be taken for trained in the other.
+        # These classes have the same source code and may have the same name. The digest of their
+        # numbers distinguishes them; otherwise a tuner trained in one would count as trained in
+        # another.
         "source_digest": hashlib.sha256(written(extended).encode()).hexdigest(),
-        # An effect at a place of a robot is made of the one that it is there.
+        # An effect at a place of a robot is derived from the registered effect.
         "made_of": tuple(library.get(name.partition("@")[0]) for name in effects),
     }
     simulator: type[Simulated] = type(re.sub(r"\W", "_", extended.name), (kind,), body)
-    # A class of a system takes these from the system when it is made; they are its own.
+    # The base class copies these from the system; replace them by the fitted ones.
     simulator.name = extended.name
     what = ", ".join(extended.effects) or "nothing added"
     simulator.says = f"{extended.system} with {what}, fitted to: {extended.title}"
@@ -350,8 +361,10 @@ def _names(kind: type[Simulated]) -> list[str]:
 
 
 def refuse_extended(kind: type[Simulated]) -> None:
-    """Raise InputError if a simulator has been extended already: its effects cannot be chosen
-    again.
+    """Check that a simulator is not extended already, because its effects are fixed.
+
+    Raises:
+        InputError: The simulator is extended already.
     """
     if hasattr(kind, "extends"):
         robot: Any = kind
@@ -362,7 +375,7 @@ def refuse_extended(kind: type[Simulated]) -> None:
 
 
 def _coefficients(extended: Extended, kind: type[Simulated]) -> list[Number]:
-    """Every coefficient in the simulator's order."""
+    """Return all coefficients in the simulator's order."""
     values = []
     for name, numbers in extended.effects.items():
         effect = library.find(name, kind.system)
@@ -376,12 +389,12 @@ def _coefficients(extended: Extended, kind: type[Simulated]) -> list[Number]:
 
 
 def _at(parameter: Parameter, number: Number) -> Parameter:
-    """The parameter with a fitted number for its nominal value, and a training range around it."""
+    """Set the nominal value of a parameter to a fitted number, with a training range around it."""
     reach = max(SPREAD * abs(number.value), _SMALLEST)
     if number.low is not None and number.high is not None:
         reach = max(reach, WIDTHS * (number.high - number.low) / 2.0)
     low, high = parameter.bounds
-    # What was fitted may lie outside what the library holds plausible; the box takes it in.
+    # The fitted value may be outside the plausible range; extend the bounds to include it.
     low, high = min(low, number.value), max(high, number.value)
     inner = (max(low, number.value - reach), min(high, number.value + reach))
     training = inner if inner[0] < inner[1] else None
@@ -389,27 +402,34 @@ def _at(parameter: Parameter, number: Number) -> Parameter:
 
 
 Find = Callable[[str], type[Simulator]]
-"""Gives the simulator that is registered under a name."""
+"""Function that returns the simulator registered under a name."""
 
 
 def load(path: Path, find: Find) -> type[Simulated]:
-    """The extended simulator in a file.
+    """Load the extended simulator from a file.
 
     Args:
-        path: extended.toml.
-        find: looks up the system that it extends.
+        path: Path of extended.toml.
+        find: Function that returns the simulator of a system.
 
     Raises:
-        InputError: the file, or the system it names, is not usable.
+        InputError: The file, or the system that it names, is not usable.
     """
     return opened(path, find)[2]
 
 
 def opened(path: Path, find: Find) -> tuple[Extended, type[Simulated], type[Simulated]]:
-    """What is in a file, the simulator of its system, and the extended simulator.
+    """Load a file together with the simulator of its system.
+
+    Args:
+        path: Path of extended.toml.
+        find: Function that returns the simulator of a system.
+
+    Returns:
+        Content of the file, the simulator class of its system, and the extended simulator class.
 
     Raises:
-        InputError: the file, or the system it names, is not usable.
+        InputError: The file, or the system that it names, is not usable.
     """
     extended = read(path)
     try:

@@ -1,7 +1,7 @@
-"""Files that are written whole or not at all, folders that are made so, and what a failed one says.
+"""Write files and folders atomically, and check that files exist.
 
-What is written stands beside its place under another name until it is complete and on the disk; a
-reader, or whoever comes after a kill, never meets half of it.
+A file is first written completely to disk under another name in the same folder, and then renamed,
+so that readers never see a partly written file, even after a crash.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from sims.base import InputError
 from sims.limits import cut
 
 Content = str | bytes
-"""Of a file; text is written as UTF-8."""
+"""Content of a file; text is written as UTF-8."""
 
 
 _MOST_LISTED = 10_000
-"""Maximum number of a folder's entries among which similar names are looked for."""
+"""Maximum number of a folder's entries among which similar names are searched."""
 
 
 def require_file(path: Path, wanted: str = "") -> None:
-    """Refuse a path where there is no file.
+    """Refuse a path that is not a file.
 
     Args:
-        path: of the file.
-        wanted: what was expected, for the message; may be empty.
+        path: Path of the file.
+        wanted: Description of the expected file for the message; may be empty.
 
     Raises:
-        InputError: the file does not exist; the message names similar files in its folder.
+        InputError: The file does not exist; the message names similar files in its folder.
     """
     expected = f"; expected {wanted}" if wanted else ""
     try:
@@ -49,7 +49,7 @@ def require_file(path: Path, wanted: str = "") -> None:
 
 
 def _similar(path: Path) -> str:
-    """The end of a message about a missing file: files of similar names beside it."""
+    """Format the names of similar files in the folder as the end of a message."""
     from difflib import get_close_matches
 
     try:
@@ -62,27 +62,33 @@ def _similar(path: Path) -> str:
 
 
 def write(path: Path, content: Content) -> None:
-    """Write a whole file or none, in place of what is there."""
+    """Write a file atomically; an existing file is replaced.
+
+    Args:
+        path: Path of the file.
+        content: Content of the file.
+    """
     with replacing(path) as partial:
         partial.write_bytes(_bytes(content))
 
 
 def write_all(contents: Mapping[Path, Content]) -> None:
-    """Write whole files, all or none, in place of what is there."""
+    """Write several files, all or none; existing files are replaced."""
     with ExitStack() as places:
-        # None takes its place before all are complete.
+        # No file is renamed before all are complete.
         for path, content in contents.items():
             places.enter_context(replacing(path)).write_bytes(_bytes(content))
 
 
 @contextmanager
 def replacing(path: Path, *, keep_ending: bool = False) -> Iterator[Path]:
-    """The place where a library may write what becomes `path` when the block ends well.
+    """Yield a temporary path that replaces `path` when the block ends without an error.
 
     Args:
-        path: the file to be; what is there is replaced.
-        keep_ending: for libraries that tell the format by the name. Elsewhere the other name has
-            an ending of its own, so that nobody who lists files by theirs takes it for one.
+        path: Path of the final file; an existing file is replaced.
+        keep_ending: Whether the temporary name keeps the ending, for libraries that derive the
+            format from it. By default it has another ending, so that the file is not listed as one
+            of its kind.
     """
     partial = _beside(path, keep_ending)
     try:
@@ -94,10 +100,10 @@ def replacing(path: Path, *, keep_ending: bool = False) -> Iterator[Path]:
 
 
 def write_new(contents: Mapping[Path, Content]) -> None:
-    """Write all files or none, and never over what is there.
+    """Write several new files, all or none; existing files are never overwritten.
 
     Raises:
-        OSError: one cannot be written, or exists (`FileExistsError`); its filename says which.
+        OSError: A file cannot be written, or exists (`FileExistsError`); its filename says which.
     """
     with ExitStack() as cleaning, ExitStack() as undoing:
         partials = {path: _beside(path) for path in contents}
@@ -110,13 +116,13 @@ def write_new(contents: Mapping[Path, Content]) -> None:
             with _naming(path):
                 _place(partial, path)
             undoing.callback(path.unlink)
-        # All stand in their places: what would take them away again is forgotten.
+        # All files are in place: keep them.
         undoing.pop_all()
 
 
 def _place(partial: Path, path: Path) -> None:
     try:
-        # Unlike a rename, this fails if somebody made the file in the meantime.
+        # Unlike a rename, this fails if the file was created in the meantime.
         os.link(partial, path)
     except FileExistsError:
         raise
@@ -128,7 +134,7 @@ def _place(partial: Path, path: Path) -> None:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """An error within is about `path`, whatever file beside it was touched."""
+    """Set the file name of an OSError to `path`, whichever temporary file caused it."""
     try:
         yield
     except OSError as error:
@@ -138,10 +144,10 @@ def _naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def fresh_folder(folder: Path) -> Iterator[Path]:
-    """A folder that takes the place of `folder`, new or empty, when the block ends well.
+    """Yield a temporary folder that becomes `folder` when the block ends without an error.
 
     Raises:
-        OSError: it cannot be made, or something is in `folder`.
+        OSError: The folder cannot be made, or `folder` is not empty.
     """
     partial = _beside(folder)
     try:
@@ -153,10 +159,10 @@ def fresh_folder(folder: Path) -> Iterator[Path]:
 
 
 def refuse_full(folder: Path) -> None:
-    """Refuse a folder that has something in it.
+    """Check that a folder is empty or does not exist.
 
     Raises:
-        InputError: it has.
+        InputError: The folder is not empty.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
@@ -165,7 +171,12 @@ def refuse_full(folder: Path) -> None:
 
 
 def stamped(parent: Path, name: str) -> Path:
-    """A folder that is not there yet, named for the time and numbered where it is taken."""
+    """Return the path of a new folder named with the time, numbered if it exists.
+
+    Args:
+        parent: Parent folder.
+        name: Beginning of the folder's name.
+    """
     stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
     folder, number = parent / f"{name}-{stamp}", 1
     while folder.exists():
@@ -175,12 +186,12 @@ def stamped(parent: Path, name: str) -> Path:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of what an error says; its class where it says nothing."""
+    """Return the first line of an error's message; its class if the message is empty."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def _beside(path: Path, keep_ending: bool = False) -> Path:
-    # The process is in the name: two that write one file at a time do not write into each other.
+    # The name contains the process id, so that two processes do not write to the same file.
     if keep_ending:
         return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     return path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -191,6 +202,6 @@ def _bytes(content: Content) -> bytes:
 
 
 def _to_disk(path: Path) -> None:
-    """Wait until a file's content is on the disk: a rename may come there before it."""
+    """Flush a file's content to disk, so that it is there before the rename."""
     with path.open("rb") as file:
         os.fsync(file.fileno())

@@ -1,5 +1,6 @@
-"""How large a number, a count or a text may be: what is beyond is a slip of the pen, and would
-overflow or hang somewhere far from where it was written.
+"""Largest plausible numbers, counts and text lengths.
+
+Larger values are mistakes, and would cause an overflow or an endless computation later.
 """
 
 from __future__ import annotations
@@ -9,51 +10,56 @@ from typing import Any
 import numpy as np
 
 LARGEST = 1e15
-"""Size of any number of a world, SI units: its powers and products stay finite."""
+"""Maximum magnitude of any number, SI units: its powers and products remain finite."""
 MOST = 10**18
-"""Size of any whole number: it fits into 64 bits, and products of several into a float."""
+"""Maximum magnitude of an integer: it fits into 64 bits, and products of several into a float."""
 FASTEST = 1e12
-"""Hz of a sampling."""
+"""Maximum sampling rate, Hz."""
 LATEST = 1e11
-"""Seconds of a stamp: 3,000 years after the zero of any clock."""
+"""Maximum time stamp in seconds: 3,000 years after the zero of any clock."""
 BRIEFEST = 1e-9
-"""Seconds that a recorded run lasts."""
+"""Minimum length of a recorded run, s."""
 NAME = 120
-"""Characters of a name or label: files are called by it."""
+"""Maximum number of characters of a name or label, which is used in file names."""
 LINE = 300
-"""Characters of a title."""
+"""Maximum number of characters of a title."""
 WORDS = 5000
-"""Characters of a description."""
+"""Maximum number of characters of a description."""
 MESSAGE = 4000
-"""Characters of a message: what a user's file quotes in it may be a megabyte."""
+"""Maximum number of characters of a message, because it may quote a large part of a user's file."""
 QUOTED = 60
-"""Characters of a name that a message quotes."""
+"""Maximum number of characters of a name that a message quotes."""
 
 
 def cut(text: str, most: int = QUOTED) -> str:
-    """The text as a message quotes it: its beginning where it is long."""
+    """Truncate a text for a message.
+
+    Args:
+        text: Text.
+        most: Maximum number of characters.
+    """
     return text if len(text) <= most else f"{text[:most]}…"
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is a number of a size that can be meant; True is none, nor is NaN."""
+    """Return whether a value is a number of plausible size; booleans and NaN are not."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
         return False
     size: Any = value
-    return bool(-LARGEST <= size <= LARGEST)  # which a whole number need not be able to as a float
+    return bool(-LARGEST <= size <= LARGEST)  # an integer may be too large for a float
 
 
-# What constants of mechanical systems can be, from dust to ships, SI units.
+# Plausible ranges of constants of mechanical systems, from dust to ships, SI units.
 MASS = (1e-9, 1e9)
 LENGTH = (1e-9, 1e6)
 INERTIA = (1e-12, 1e12)
 GRAVITY = (0.0, 1000.0)
-"""m/s^2; the Sun's is 274."""
+"""Plausible range of gravitational acceleration, m/s^2; the Sun's is 274."""
 TURN = (-1e3, 1e3)
-"""rad, of an angle."""
+"""Plausible range of an angle, rad."""
 RATIO = (0.0, 1e3)
 VOLTAGE = (1e-3, 1e6)
 GAIN = (-1e9, 1e9)
-"""Of a controller, in whatever unit."""
+"""Plausible range of a controller's gain, in any unit."""
 PIXELS = (16.0, 4096.0)
-"""Width and height of a picture."""
+"""Plausible range of width and height of a picture, pixels."""

@@ -1,4 +1,4 @@
-"""Memory that has been freed, back to the operating system."""
+"""Return freed memory to the operating system."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import ctypes
 
 
 def release_free_memory() -> None:
-    """Give memory that is free back to the operating system, where the C library keeps it.
+    """Return freed memory to the operating system if the C library retains it.
 
-    The allocator of glibc keeps what lies below memory in use: after the meshes of a model are
-    freed these are hundreds of megabytes, which workers and laptops lack. Other C libraries have
-    no such call and need none.
+    The allocator of glibc retains free memory below memory in use: after the meshes of a model are
+    freed, this is hundreds of megabytes, which are missing on workers and laptops. Other C
+    libraries have no such call and need none.
     """
     with contextlib.suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,9 +1,8 @@
-"""A user's own model in PyBullet, MuJoCo or anything else that steps, as a simulator; see
-docs/own-simulator.md.
+"""Base class of user-defined simulators in PyBullet, MuJoCo or any other engine.
 
-Subclass `OwnSimulator`, declare what it is, and give `reset`, `step` and `observe`. Effects on
-inputs and sensors then act on it as on any other; effects that are forces and dry frictions do if
-it takes forces (`apply_force`, `inertia`).
+Subclass `OwnSimulator`, declare its attributes, and implement `reset`, `step` and `observe`; see
+docs/own-simulator.md. Effects on inputs and sensors are then supported as for any simulator; forces
+and dry friction are supported if it implements `apply_force` and `inertia`.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from sims.system import (
 
 
 class OwnSystem(System):
-    """The declaration behind an own simulator, made from its class attributes."""
+    """System of a user-defined simulator, made from its class attributes."""
 
     name = "own"
     says = "a user's own simulator"
@@ -53,20 +52,22 @@ class OwnSystem(System):
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
-        """An effect on levels at each of them, any other as it is."""
+        """Return an effect on levels once for each level, and any other effect unchanged."""
         if issubclass(effect, Level) and not effect.misses(cls):
             return at_levels(effect, cls)
         return super().placed(effect)
 
     @classmethod
     def effect(cls, name: str) -> type[Effect] | None:
-        """The effect of a name such as ``state.overflow@upper``."""
+        """Return the effect with a name such as ``state.overflow@upper``; None if there is none."""
         return named(name, cls)
 
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:
-        """A force needs the simulator's hook; dry friction its inertia besides; an impact is out of
-        reach.
+        """Return why the simulator cannot have an effect; empty if it can.
+
+        Forces need the method `apply_force`, dry friction also needs `inertia`, levels need `put`;
+        effects on impacts and hidden-state effects are not possible.
         """
         if issubclass(effect, Contact):
             return "an own simulator does not say when it strikes something"
@@ -87,31 +88,31 @@ class OwnSystem(System):
         return ""
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """Not known outside the simulator."""
+        """Raise an error, because the mass is unknown outside the simulator."""
         raise _UnsaidError("it does not say its mass")
 
     def weight(self, moment: Moment) -> Array:
-        """Not known outside the simulator."""
+        """Raise an error, because gravity is unknown outside the simulator."""
         raise _UnsaidError("it does not say what gravity does to it")
 
     def drive(self, moment: Moment) -> Array:
-        """Not known outside the simulator."""
+        """Raise an error, because the effect of inputs is unknown outside the simulator."""
         raise _UnsaidError("it does not say what its inputs do to it")
 
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """The motion of an own simulator is what it observes."""
+        """Return the channels, which are the motion that a user-defined simulator returns."""
         return {c.name: x[:, :, i] for i, c in enumerate(self.channels)}
 
 
 class _UnsaidError(InputError):
-    """Something that an effect asks for and the simulator does not say."""
+    """Error for a quantity that an effect needs and the simulator does not provide."""
 
 
 def _ask(effect: type[Effect], system: type[OwnSystem]) -> None:
-    """Let the effect ask the system once for all it needs."""
-    # With coefficients of zero at rest at zero: what it asks for counts, not what comes out.
+    """Evaluate the effect once, so that a missing quantity of the system raises an error."""
+    # Coefficients and states are zero: only the requested quantities matter, not the result.
     one = np.ones((1, 1))
     d = len(system.coordinates)
     constants = {c.name: c.value * one for c in system.constants}
@@ -127,22 +128,23 @@ def _ask(effect: type[Effect], system: type[OwnSystem]) -> None:
 
 
 class OwnSimulator(Simulated):
-    """Base of a user's own simulator.
+    """Base class of a user-defined simulator.
 
     Declare the attributes of `Simulator` (name, says, parameters, channels, constants, inputs,
-    states, requires), then those below where they apply, and write `reset`, `step` and `observe`.
+    states, requires), then those below where they apply, and implement `reset`, `step` and
+    `observe`.
 
     Attributes:
-        time_step: the longest step in seconds; `step` is called with this or less, so that every
-            sample is hit.
-        kind: how its forces count: ``linear`` in N, ``rotary`` in N m, ``point`` per unit mass.
-        coordinates: states that are its generalised position, for effects that are forces.
-        rates: states that are their rates, in the same order.
-        levels: states that are stores, such as a tank's level, which may spill over; each is a
-            channel, too.
+        time_step: Maximum step, s; `step` is called with this or less, so that each sample time is
+            reached exactly.
+        kind: Unit of forces: ``linear`` in N, ``rotary`` in N m, ``point`` per unit mass.
+        coordinates: States that are the generalised position, for effects that are forces.
+        rates: States that are the rates of the coordinates, in the same order.
+        levels: States that are stored quantities, such as a tank's level, which may overflow; each
+            is also a channel.
 
     Raises:
-        InputError: the declaration contradicts itself.
+        InputError: The declaration is contradictory.
     """
 
     system = OwnSystem
@@ -156,7 +158,7 @@ class OwnSimulator(Simulated):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         _check(cls)
         forced = {*cls.coordinates, *cls.rates}
-        # Whatever else has a start travels with the rates, since an engine hands on two vectors.
+        # Other states are appended to the rates, because engines pass two vectors only.
         others = [name for name in cls.states if name not in forced]
         summary = " ".join((cls.__doc__ or cls.says).split("\n\n")[0].split())
         shared = ("name", "parameters", "channels", "constants", "inputs", "states")
@@ -170,13 +172,13 @@ class OwnSimulator(Simulated):
             "sensed": tuple(c.name for c in cls.channels),
             "simulator": cls,
         }
-        # A system for each simulator: effects ask the class, not an instance, what it can have.
+        # Each simulator has its own system class: effects query the class, not an instance.
         system: Any = type(f"{cls.__name__}System", (OwnSystem,), declared)
         cls.system = system
         super().__init_subclass__(**kwargs)
 
     def __setattr__(self, name: str, value: object) -> None:
-        # A user's `self.engine = ...` would otherwise break the base class far from its cause.
+        # Otherwise a user's `self.engine = ...` would break the base class far from its cause.
         if name in _TAKEN and name in self.__dict__:
             raise InputError(
                 f"simulator {self.name}: the attribute '{name}' is the base class's; name yours"
@@ -191,23 +193,35 @@ class OwnSimulator(Simulated):
         constants: Mapping[str, float],
         initial: Mapping[str, float],
     ) -> None:
-        """Start a run: parameters, constants and initial state by name.
+        """Start a run.
 
-        It must set all that a run may have changed, so that a run depends on nothing before it.
+        All that an earlier run may have changed must be set, so that runs are independent.
+
+        Args:
+            theta: Parameters by name.
+            constants: Constants by name.
+            initial: Initial state by name.
         """
 
     @abstractmethod
     def step(self, inputs: Mapping[str, float], seconds: float) -> None:
-        """Go on by `seconds` with these inputs."""
+        """Advance the simulation.
+
+        Args:
+            inputs: Inputs by name, constant during the step.
+            seconds: Length of the step, s.
+        """
 
     @abstractmethod
     def observe(self) -> Mapping[str, float]:
-        """What the sensors give now, at least every channel; for force effects the coordinates and
-        rates as well.
+        """Return the current sensor values by name.
+
+        They must include every channel; for effects that are forces, also the coordinates and
+        rates.
         """
 
     def apply_force(self, force: Array) -> None:
-        """Optional: add a generalised force to the next step, and to that step alone.
+        """Add a generalised force to the next step only (optional).
 
         Args:
             force: (D,) one value for each coordinate: N, N m, or m/s^2 for ``point``.
@@ -215,16 +229,16 @@ class OwnSimulator(Simulated):
         raise NotImplementedError
 
     def inertia(self) -> float | Array:
-        """Optional: return the generalised inertia now, which dry friction needs to hold still.
+        """Return the current generalised inertia, which dry friction needs (optional).
 
         Returns:
-            The inertia matrix (D, D) of the coordinates, or a number where every coordinate has
-            the same inertia and none acts on another; kg, kg m^2, or 1 for ``point``.
+            The inertia matrix (D, D) of the coordinates, or a number if all coordinates have the
+            same inertia and are not coupled; kg, kg m^2, or 1 for ``point``.
         """
         raise NotImplementedError
 
     def put(self, levels: Mapping[str, float]) -> None:
-        """Optional: give these levels these values and go on from there; the others stay."""
+        """Set some levels to new values and continue from there; other states stay (optional)."""
         raise NotImplementedError
 
     def _engine(self, name: str | None, settings: Mapping[str, Any]) -> Engine:
@@ -241,7 +255,7 @@ class OwnSimulator(Simulated):
         return OwnEngine(self, step)
 
     def close(self) -> None:
-        """Give back what the simulator holds."""
+        """Release resources of the simulator."""
 
 
 _TAKEN = ("channels", "columns", "constant_values", "effects", "engine", "fixed", "parameters")
@@ -272,14 +286,15 @@ def _check(cls: type[OwnSimulator]) -> None:
 
 
 class BulletWorld:
-    """A world in PyBullet, whose functions are its methods; it prints nothing and ends with its
-    last reference.
+    """PyBullet world with the functions of ``pybullet`` as methods.
+
+    It prints nothing, and is disconnected when its last reference is deleted.
     """
 
     def __init__(self) -> None:
         self._engine = engine()
         self._client: int = self._engine.connect(self._engine.DIRECT)
-        # Not `__del__`, which may run when the interpreter has lost the module already.
+        # Not `__del__`, which may run after the interpreter has unloaded the module.
         weakref.finalize(self, self._engine.disconnect, self._client)
 
     def __getattr__(self, name: str) -> Any:

@@ -1,8 +1,8 @@
-"""Steps a user's own simulator, and puts effects that are forces into it.
+"""Engine that steps a user-defined simulator and applies effects to it.
 
-Dry friction is the force that would stop the motion within the coming step of length h, as far as
-its limit L allows. With the inertia matrix M (D, D), the velocity v (D,), the forces F (D,) of
-effects and the simulator's own force P, which is unknown and estimated from the step before,
+Dry friction is the force that would stop the motion within the next step of length h, up to
+its limit L. With the inertia matrix M (D, D), the velocity v (D,), the forces F (D,) of
+effects and the simulator's own force P, which is unknown and estimated from the previous step,
 
     P = M (v - v_before) / h_before - F_before                             (1)
     S = -(M v / h + P + F)                                                 (2)
@@ -25,7 +25,7 @@ from sims.system import Force, Friction, Lanes, Level, Moment, Motion, System
 
 
 class Stepping(Protocol):
-    """What is stepped, as `sims.own.OwnSimulator` is; its methods are described there."""
+    """Protocol of a steppable simulator; `sims.own.OwnSimulator` describes the methods."""
 
     @property
     def name(self) -> str: ...
@@ -55,7 +55,7 @@ class Stepping(Protocol):
 
 
 class OwnEngine:
-    """Steps an own simulator, lane after lane."""
+    """Engine that steps a user-defined simulator, one batch element after another."""
 
     name = "own"
     requires: tuple[str, ...] = ()
@@ -65,19 +65,19 @@ class OwnEngine:
         self.largest_step = float(step)
 
     def refuses(self, system: type[System]) -> str:  # noqa: ARG002
-        """Nothing."""
+        """Return an empty text, because every system is supported."""
         return ""
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Do nothing, because there are no resources."""
 
     def integrate(self, lanes: Lanes) -> Motion:
-        """Return readings (L, R, C) in place of positions, a row after every `lanes.every` steps
-        and one before the first.
+        """Return readings (L, R, C) instead of positions.
+
+        There is one row before the first step, and one after every `lanes.every` steps.
 
         Raises:
-            InputError: a method of the simulator raised an exception, or gave something else than
-                it must.
+            InputError: A method of the simulator raised an exception or returned a wrong value.
         """
         count = lanes.steps.shape[1] // lanes.every + 1
         width = len(lanes.system.channels)
@@ -103,7 +103,7 @@ class OwnEngine:
         states = (*system.coordinates, *system.rates)
         start = [*lanes.x[lane].tolist(), *lanes.v[lane].tolist()]
         initial = dict(zip(states, start, strict=True))
-        # A user's model is never asked what it makes of NaN: it may hang, or never recover.
+        # Never pass NaN to a user's model: it may hang or never recover.
         given = [*theta.values(), *constants.values(), *initial.values()]
         if not np.isfinite(given).all():
             return None
@@ -112,7 +112,7 @@ class OwnEngine:
         rims = _Rims(lanes, lane, world)
         rims.keep()
         steps = lanes.steps[lane].copy()
-        # Steps of no length, in which the lane waits for others, are no steps of the simulator.
+        # Steps of zero length, in which this batch element waits for others, are skipped.
         moving = steps > 0
         steps[moving] = evened(steps[moving], lanes.every)
         row = self._row(system)
@@ -128,7 +128,7 @@ class OwnEngine:
                 rims.keep()
                 t = t + seconds
                 moved = True
-            # Nothing has changed where nothing has moved: the row before is the row now.
+            # Without a step, the previous row is still valid.
             if (i + 1) % lanes.every == 0:
                 row = self._row(system) if moved else row
                 moved = False
@@ -141,7 +141,7 @@ class OwnEngine:
 
 
 def _fault(world: Stepping, error: Exception) -> InputError:
-    """The error where the code of a simulator raised an exception: which, and at which line."""
+    """Make the error for an exception in the simulator's code, with its line."""
     frames = traceback.extract_tb(error.__traceback__)
     module = sys.modules.get(type(world).__module__)
     own = [frame for frame in frames if frame.filename == getattr(module, "__file__", None)]
@@ -152,21 +152,21 @@ def _fault(world: Stepping, error: Exception) -> InputError:
 
 
 def observed(world: Stepping, seen: Mapping[str, float], name: str) -> float:
-    """Return one value of what `observe` gave.
+    """Return one value of the result of `observe`.
 
     Args:
-        world: the simulator.
-        seen: what its `observe` gave.
-        name: of a channel, a coordinate, a rate or a level.
+        world: Simulator.
+        seen: Result of its `observe`.
+        name: Name of a channel, coordinate, rate or level.
 
     Raises:
-        InputError: there is no such value, or it is not a number.
+        InputError: The value is missing, or not a number.
     """
     try:
         value = seen[name]
     except (KeyError, TypeError, IndexError):
         raise _unobserved(world, seen, name) from None
-    if isinstance(value, float):  # also NumPy's; the general test takes longer than all the rest
+    if isinstance(value, float):  # shortcut (NumPy floats, too), because the general test is slow
         return float(value)
     if shape := np.shape(value):
         raise InputError(
@@ -181,7 +181,7 @@ def observed(world: Stepping, seen: Mapping[str, float], name: str) -> float:
 
 
 def _unobserved(world: Stepping, seen: object, name: str) -> InputError:
-    """The error where `observe` gave no value of this name."""
+    """Make the error for a value that `observe` did not return."""
     if not isinstance(seen, Mapping):
         found = type(seen).__name__
         return InputError(
@@ -193,13 +193,13 @@ def _unobserved(world: Stepping, seen: object, name: str) -> InputError:
 
 
 def inertia_of(world: Stepping) -> float | Array:
-    """Return the generalised inertia of a simulator now.
+    """Return the current generalised inertia of a simulator.
 
     Returns:
-        A number, which is that along every coordinate, or a matrix (D, D).
+        A number, which applies to every coordinate, or a matrix (D, D).
 
     Raises:
-        InputError: `inertia` gave neither.
+        InputError: `inertia` returned neither.
     """
     given = world.inertia()
     if isinstance(given, float):
@@ -221,7 +221,7 @@ def inertia_of(world: Stepping) -> float | Array:
 
 
 class _Rims:
-    """What bounds the levels of one lane."""
+    """Limits of the levels of one batch element."""
 
     def __init__(self, lanes: Lanes, lane: int, world: Stepping) -> None:
         self.acting = []
@@ -232,7 +232,7 @@ class _Rims:
         self.world = world
 
     def keep(self) -> None:
-        """Take from the levels what is too much."""
+        """Limit the levels."""
         if not self.acting:
             return
         seen = self.world.observe()
@@ -244,7 +244,7 @@ class _Rims:
 
 
 class _Forces:
-    """The effects' forces on one lane."""
+    """Forces of the effects on one batch element."""
 
     def __init__(self, lanes: Lanes, lane: int, world: Stepping) -> None:
         here = [(effect, c[:, lane : lane + 1]) for effect, c in lanes.effects]
@@ -259,7 +259,13 @@ class _Forces:
         self._last: tuple[Array, Array, float] | None = None
 
     def at(self, t: float, inputs: Mapping[str, float], seconds: float) -> Array:
-        """(D,) the sum over the coming step."""
+        """Return the sum (D,) of the effects' forces for the next step.
+
+        Args:
+            t: Time since the start of the run, s.
+            inputs: Inputs by name.
+            seconds: Length of the step, s.
+        """
         seen = self.world.observe()
         x = self._state(seen, self.world.coordinates)
         v = self._state(seen, self.world.rates)
@@ -274,9 +280,9 @@ class _Forces:
         return force
 
     def _friction(self, moment: Moment, force: Array, seconds: float) -> Array:
-        """What stops the motion within the step, as far as the limit allows.
+        """Return the force (D,) that stops the motion within the step, up to the limit.
 
-        What the simulator itself pulls with is taken from the last step.
+        The simulator's own force is estimated from the last step.
         """
         inertia = inertia_of(self.world)
         v = moment.v[0]

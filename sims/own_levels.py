@@ -1,6 +1,8 @@
-"""Effects at what an own simulator stores: a registered effect on levels becomes a class for each
-level, named ``effect@level`` where there are several, with the level's unit and a range about its
-typical size.
+"""Effects on the levels of a user-defined simulator.
+
+A registered effect on levels becomes one class per level, named ``effect@level`` if there are
+several levels. Its unit is that of the level, and its range is scaled to the typical size of the
+level.
 """
 
 from __future__ import annotations
@@ -17,7 +19,12 @@ from sims.system import Coefficient, Effect, Level, System
 
 @lru_cache(maxsize=64)
 def at_levels(effect: type[Level], system: type[System]) -> tuple[type[Effect], ...]:
-    """The effect at each level of a system; empty where that has none."""
+    """Return the effect at each level of a system; empty if it has no levels.
+
+    Args:
+        effect: Registered effect.
+        system: System of a user-defined simulator.
+    """
     levels = [channel for channel in system.channels if channel.name in system.levels]
     made = []
     for channel in levels:
@@ -35,17 +42,21 @@ def at_levels(effect: type[Level], system: type[System]) -> tuple[type[Effect], 
 
 
 def _sized(c: Coefficient, unit: str, scale: float) -> Coefficient:
-    """In the unit of a level, and in its size."""
+    """Convert a coefficient to the unit and size of a level."""
     low, high = c.plausible[0]
     return replace(c, units=(unit,) * 3, plausible=((low * scale, high * scale),) * 3)
 
 
 def named(name: str, system: type[System]) -> type[Effect] | None:
-    """The effect of a name such as ``state.overflow@upper``; None for one that is not on levels.
+    """Return the effect with a name such as ``state.overflow@upper``; None if it is not on levels.
+
+    Args:
+        name: Name of the effect.
+        system: System of a user-defined simulator.
 
     Raises:
-        InputError: it cannot be on this system, or not at this place; the message says why, or
-            where it is.
+        InputError: The effect is not possible on this system or at this place; the message states
+            the reason or the possible places.
     """
     base, at, place = name.partition("@")
     try:

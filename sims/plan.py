@@ -1,25 +1,24 @@
-"""When a simulation steps, and what its plant feels: sample instants, steps and inputs of many
-lanes at once.
+"""Integration time grid and applied inputs of many batch elements.
 
-Effects that shift time (a sensor's delay, a skewed clock) move the instants at which the world is
-sampled; effects on the input change the signal before the integration starts, since it does not
-depend on the plant. So every engine has them. What a lane gets does not depend on the others, but
-for steps of no length in which it waits for them.
+Effects that shift time (a sensor's delay, a skewed clock) move the times at which the system is
+sampled. Effects on the input change the signal before the integration starts, since it does not
+depend on the plant. Therefore every engine supports them. The result of a batch element does not
+depend on the others, except for steps of zero length in which it waits for them.
 
-A command u holds its value from one sample to the next. Over a step from a to b the plant feels its
-mean, of which the integral A is piecewise linear:
+A command u is held from one sample to the next (zero-order hold). Over a step from a to b its mean
+is applied to the plant; its integral A is piecewise linear:
 
     (A(b) - A(a)) / (b - a),    A(t) = sum of u_i (t_{i+1} - t_i) up to t  (1)
 
-Where a scenario says that it goes straight from sample to sample, A is made of parabolas instead.
+Where a scenario states linear interpolation between samples, A is piecewise quadratic instead.
 
-An effect that shifts time feels at t what was commanded at s(t); the change commanded at t is then
-felt at
+With an effect that shifts time, the command of the time s(t) is applied at t. The change commanded
+at t is then applied at
 
     t + (t - s(t))                                                         (2)
 
-which is right where the shift is the same at both instants, as it is for a delay, and all but
-right for one that hardly changes.
+This is exact if the shift is equal at both times, as for a delay, and a good approximation if it
+changes slowly.
 """
 
 from __future__ import annotations
@@ -35,10 +34,10 @@ from sims.base import Array, Scenario
 from sims.system import Acting, Effect, Input, Sensor, Signal
 
 _ROUNDING = 1e-6
-"""Share of a step by which an interval may exceed a whole number of steps."""
+"""Fraction of a step by which an interval may exceed an integer number of steps."""
 
 FINE = 2e-3
-"""Seconds of a step before the run, where no step within it is longer."""
+"""Maximum step before the run in seconds, unless a step within the run is longer."""
 
 Indices = NDArray[np.intp]
 Number = TypeVar("Number", np.float64, np.intp)
@@ -46,14 +45,15 @@ Number = TypeVar("Number", np.float64, np.intp)
 
 @dataclass(frozen=True)
 class Plan:
-    """The steps of all lanes.
+    """Time grid: the steps of all batch elements.
 
     Attributes:
-        steps: (L, S) lengths, seconds; S is a multiple of `every`. Lanes may share memory.
-        ends: (L, S) seconds since the start of the run at the end of each step.
-        every: after this many steps the state is kept; the initial state is kept first.
-        rows: (L, T) which of the kept states each sample shows.
-        alike: whether lanes of one run make the same steps.
+        steps: (L, S) lengths of the steps, s; S is a multiple of `every`. Batch elements may share
+            memory.
+        ends: (L, S) time since the start of the run at the end of each step, s.
+        every: Number of steps after which the state is stored; the initial state is stored first.
+        rows: (L, T) number of the stored state for each sample.
+        alike: Whether batch elements with the same scenario have the same steps.
     """
 
     steps: Array
@@ -65,19 +65,20 @@ class Plan:
 
 @dataclass(frozen=True)
 class Runs:
-    """Scenarios of lanes, of which many may be the same.
+    """Scenarios of batch elements, grouped if they are equal.
 
     Attributes:
-        distinct: scenarios that differ in their times or inputs.
-        of: (L,) which of them each lane has.
+        distinct: Scenarios that differ in their times or inputs.
+        of: (L,) number of the distinct scenario of each batch element.
     """
 
     distinct: tuple[Scenario, ...]
     of: Indices
 
     def spread(self, rows: NDArray[Number]) -> NDArray[Number]:
-        """Rows (N, ...) of the distinct scenarios as rows of the lanes; one row is that of all, and
-        shares memory.
+        """Expand rows (N, ...) of the distinct scenarios to rows (L, ...) of the batch elements.
+
+        A single row is broadcast and shares memory.
         """
         if len(rows) == 1:
             return np.broadcast_to(rows, (self.of.size, *rows.shape[1:]))
@@ -85,13 +86,13 @@ class Runs:
 
 
 def make_runs(scenarios: Sequence[Scenario], by_initial: bool = False) -> Runs:
-    """Group scenarios (one a lane) with the same times and inputs.
+    """Group scenarios with the same times and inputs.
 
     Args:
-        scenarios: of the lanes.
-        by_initial: whether the initial states that they state are to be the same, too.
+        scenarios: Scenario of each batch element.
+        by_initial: Whether grouped scenarios must also state the same initial states.
     """
-    # Told apart by object first: comparing contents costs more than most lanes' share of a step.
+    # Compare objects first, because comparing the contents of each scenario is slow.
     objects, of = by_object(scenarios)
     by_content: dict[object, int] = {}
     distinct: list[Scenario] = []
@@ -112,8 +113,8 @@ def make_runs(scenarios: Sequence[Scenario], by_initial: bool = False) -> Runs:
 
 
 def by_object(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], Indices]:
-    """The different objects among scenarios (one a lane), and which of them each lane has (L,)."""
-    # A lane costs one look into a dictionary, and there may be thousands.
+    """Return the distinct objects among scenarios, and the number of each element's object (L,)."""
+    # One dictionary lookup per batch element, of which there may be thousands.
     objects = {id(scenario): scenario for scenario in scenarios}
     place = {key: i for i, key in enumerate(objects)}
     of = np.array([place[id(scenario)] for scenario in scenarios], dtype=np.intp)
@@ -125,22 +126,21 @@ Commands = Sequence[Mapping[str, Array]]
 
 
 def make_plan(runs: Runs, commands: Commands, acting: Acting, largest_step: float) -> Plan:
-    """Steps through every instant at which a sample is taken or a changed command felt.
+    """Build steps through all times at which a sample is taken or a changed command is applied.
 
-    A sample that would be taken before the start shows the initial state. Shorter runs wait at
-    their end.
+    A sample before the start shows the initial state. Shorter runs wait at their end.
 
     Args:
-        runs: scenarios of the lanes.
-        commands: inputs of each distinct scenario.
-        acting: effects on input and sensors.
-        largest_step: no step is longer, in seconds.
+        runs: Scenarios of the batch elements.
+        commands: Inputs of each distinct scenario.
+        acting: Effects on input and sensors.
+        largest_step: Maximum length of a step, s.
     """
     samples = max(s.times.size for s in runs.distinct)
     instants = np.stack([_padded(_since_start(s), samples) for s in runs.distinct])
     shifting = [(e, c) for e, c in acting if c.any() and _shifts(e)]
     if not shifting and not any(s.offset for s in runs.distinct):
-        # Runs with the same instants share one row, and all that is computed from it.
+        # Runs with the same sample times share one row and everything computed from it.
         if (instants == instants[:1]).all():
             instants = instants[:1]
         steps, ends, every, rows = _divided(instants, largest_step)
@@ -149,7 +149,7 @@ def make_plan(runs: Runs, commands: Commands, acting: Acting, largest_step: floa
     for effect, c in shifting:
         if isinstance(effect, Sensor):
             instants = np.where(acts(c), effect.times(c, instants), instants)
-    # Time never runs backwards, whatever an effect makes of it, and begins with the run.
+    # Times must increase and begin with the run, whatever an effect returns.
     instants = np.maximum(instants, 0.0)
     instants = np.maximum.accumulate(instants, axis=1)
     changes = _changes(runs, commands, shifting)
@@ -158,26 +158,26 @@ def make_plan(runs: Runs, commands: Commands, acting: Acting, largest_step: floa
     order = np.argsort(marks, axis=1, kind="stable")
     marks = np.take_along_axis(marks, order, axis=1)
     steps, ends, every, rows = _divided(marks, largest_step)
-    # The rows of the sorted marks back in the order of the marks, of which the first are samples.
+    # Rows in the original order of the marks, of which the first are samples.
     back = np.empty_like(rows)
     np.put_along_axis(back, order, rows, axis=1)
     return Plan(steps, ends, every, back[:, :samples])
 
 
 def _changes(runs: Runs, commands: Commands, shifting: Sequence[tuple[Effect, Array]]) -> Array:
-    """Instants (L, K) at which a changed command is felt; zero where a lane has fewer."""
+    """Return the times (L, K) at which a changed command is applied; zero where there are fewer."""
     columns = []
     for place, name in enumerate(commands[0]):
         rows = []
         for s, u in zip(runs.distinct, commands, strict=True):
             changed = np.diff(u[name]) != 0
             later = np.maximum(_commanded(s)[1:], 0.0)
-            # What was commanded before the run may be felt within it.
+            # Commands from before the run may be applied within it.
             rows.append(np.concatenate([_earlier(s, name), later[changed]]))
         size = max(row.size for row in rows)
         padded = [np.concatenate([row, np.zeros(size - row.size)]) for row in rows]
         felt = np.stack(padded)[runs.of]
-        # Effects act on the first input.
+        # Effects act on the first input only.
         for effect, c in shifting if place == 0 else ():
             if isinstance(effect, Input):
                 commanded = effect.times(c, felt)
@@ -189,26 +189,33 @@ def _changes(runs: Runs, commands: Commands, shifting: Sequence[tuple[Effect, Ar
 
 
 def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, Indices]:
-    """Steps and their ends (N, S) through instants (N, T), after how many a state is kept, which
-    one at each instant.
+    """Divide the intervals between times into equal steps.
 
-    An interval is divided into equal steps; those of a lane depend on no other. They are laid into
-    blocks of as many steps as most intervals have, and steps of no length fill the last block of an
-    interval.
+    The steps are arranged in blocks of the most frequent number of steps per interval; steps of
+    zero length fill the last block of an interval. The steps of a batch element do not depend on
+    others.
+
+    Args:
+        instants: (N, T) times since the start, s.
+        largest_step: Maximum length of a step, s.
+
+    Returns:
+        Steps (N, S), their ends (N, S), the number of steps per stored state, and the number of the
+        stored state at each time (N, T).
     """
     lanes, samples = instants.shape
     start = np.zeros((lanes, 1))
     before = np.concatenate([start, instants[:, :-1]], axis=1)
     intervals = instants - before
-    # An interval of a whole number of steps has that number, whatever its rounding.
+    # Tolerate rounding where an interval is an integer number of steps.
     parts = np.ceil(intervals / largest_step - _ROUNDING).astype(np.intp)
     parts = np.where(intervals > 0, np.maximum(parts, 1), 0)
     every = int(np.bincount(parts[parts > 0]).argmax()) if parts.any() else 1
     blocks = -(-parts // every)
     rows = np.cumsum(blocks, axis=1)
     size = max(int(rows[:, -1].max()), 1)
-    # From here on one entry a block: its interval, its number in the lane, the numbers of its steps
-    # in the interval.
+    # Arrays with one entry per block: its interval, its number in the batch element, and the
+    # numbers of its steps in the interval.
     interval = np.repeat(np.arange(lanes * samples), blocks.ravel())
     lane = interval // samples
     in_lane = rows[:, -1]
@@ -222,7 +229,7 @@ def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, I
     steps = np.zeros((lanes, size, every))
     ends = np.repeat(instants[:, -1], size * every).reshape(lanes, size, every)
     steps[lane, block] = np.where(number < count, length, 0.0)
-    # The last step of an interval ends at the instant itself and not near it.
+    # The last step of an interval ends exactly at the given time.
     inside = before.ravel()[interval, None] + (number + 1) * length
     instant = instants.ravel()[interval, None]
     ends[lane, block] = np.where(number + 1 < count, inside, instant)
@@ -230,19 +237,19 @@ def _divided(instants: Array, largest_step: float) -> tuple[Array, Array, int, I
 
 
 def _since_start(scenario: Scenario) -> Array:
-    """(T,) seconds since the first sample."""
+    """Return the sample times (T,) since the first sample, s."""
     seconds: Array = scenario.times - scenario.times[0]
     return seconds
 
 
 def _commanded(scenario: Scenario) -> Array:
-    """(T,) seconds since the first sample at which inputs have their values."""
+    """Return the times (T,) since the first sample at which inputs change, s."""
     seconds: Array = _since_start(scenario) + scenario.offset
     return seconds
 
 
 def _earlier(scenario: Scenario, name: str) -> Array:
-    """(K,) the same of an input before the run, as far as it is known."""
+    """Return the times (K,) of an input's known history before the run, s."""
     if name not in scenario.before:
         return np.empty(0)
     earlier: Array = scenario.before[name][0] + scenario.offset
@@ -250,31 +257,39 @@ def _earlier(scenario: Scenario, name: str) -> Array:
 
 
 def _signal(scenario: Scenario, name: str, values: Array) -> Array:
-    """(K + T,) the values at these instants, from those in the run (T,)."""
+    """Return the values (K + T,) of an input, including its known history before the run.
+
+    Args:
+        scenario: Scenario with the history.
+        name: Name of the input.
+        values: (T,) values in the run.
+    """
     if name not in scenario.before:
         return values
     return np.concatenate([scenario.before[name][1], values])
 
 
 def _padded(values: Array, size: int) -> Array:
-    """`values` and their last one, over and over, up to this size."""
+    """Repeat the last of `values` up to the given size."""
     more = np.full(size - values.size, values[-1])
     return np.concatenate([values, more])
 
 
 def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> dict[str, Array]:
-    """What the plant feels over each step, (L, S) by name: each command's mean over the step,
-    through the effects.
+    """Return the applied inputs: the mean of each command over each step, changed by the effects.
 
-    A command holds its value from one recorded sample to the next, and had its first value before
-    the first, unless more is known. Effects act on the first input; those with a memory begin where
-    it is known first.
+    A command is held between recorded samples, and had its first value before the first sample,
+    unless its history is known. Effects act on the first input; effects with memory begin at the
+    start of the known history.
 
     Args:
-        plan: the steps.
-        runs: scenarios of the lanes.
-        commands: inputs of each distinct scenario.
-        acting: input effects in the order in which the signal passes them.
+        plan: Time grid.
+        runs: Scenarios of the batch elements.
+        commands: Inputs of each distinct scenario.
+        acting: Input effects in the order in which the signal passes them.
+
+    Returns:
+        Applied inputs (L, S) by name.
     """
     effects = tuple((effect, c, acts(c)) for effect, c in acting if c.any())
     begin, end, steps = _before(plan.ends), plan.ends, plan.steps
@@ -289,15 +304,15 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
         parts = zip(lead, (begin, end, steps), strict=True)
         begin, end, steps = (np.hstack([before[runs.of], now]) for before, now in parts)
     ends = end
-    # Back from the plant to the command: the last effect asks the one before it for its instants.
+    # Backwards from the plant to the command: map the times through the effects.
     for effect, c, on in reversed(effects):
         assert isinstance(effect, Input)
-        # Most effects leave instants as they are, and then nothing is asked of every single lane.
+        # Most effects do not shift time; skip them.
         if not _shifts(effect):
             continue
         begin = np.where(on, effect.times(c, begin), begin)
         end = np.where(on, effect.times(c, end), end)
-    # And forward with the values.
+    # Forwards with the values.
     means = _felt(runs, first, commands, begin, end, plan.alike)
     for effect, c, on in effects:
         if isinstance(effect, Input) and effect.between:
@@ -310,8 +325,16 @@ def felt_inputs(plan: Plan, runs: Runs, commands: Commands, acting: Acting) -> d
 
 
 def _led(runs: Runs, name: str, largest: float) -> tuple[Array, Array, Array]:
-    """(N, K) each: beginnings, ends and lengths of steps before the runs, in which an input is
-    known; none is longer than `largest`, and they have no length where it is not.
+    """Build the steps before the runs in which the history of an input is known.
+
+    Args:
+        runs: Scenarios of the batch elements.
+        name: Name of the input.
+        largest: Maximum length of a step, s.
+
+    Returns:
+        Beginnings, ends and lengths (N, K) of the steps, s; the length is zero where the history is
+        unknown.
     """
     marks = [_earlier(s, name) for s in runs.distinct]
     marks = [np.append(row[row < 0], 0.0) for row in marks]
@@ -332,21 +355,25 @@ def _passed(
     means: Array,
     start: Array,
 ) -> Array:
-    """(L, S) what becomes of `means` (L, S) on their way through effects on the input.
+    """Pass the means of the command through the effects on the input.
 
     Args:
-        effects: with their coefficients, and where they act, (L, 1).
-        steps: (L, S) lengths.
-        ends: (L, S) their ends.
-        means: of the command over each step.
-        start: (L, 1) the command's first value, which has always been there before the first step.
+        effects: Effects with their coefficients, and masks (L, 1) of the batch elements in which
+            they are active.
+        steps: (L, S) lengths of the steps, s.
+        ends: (L, S) ends of the steps, s.
+        means: (L, S) mean of the command over each step.
+        start: (L, 1) first value of the command, which it also had before the first step.
+
+    Returns:
+        Applied values (L, S).
     """
     lasting = _lasting(steps)
     values = np.take_along_axis(means, lasting, axis=1)
     start = start.copy()
     for effect, c, on in effects:
         assert isinstance(effect, Input)
-        # Of hundreds of lanes an effect may act in a few: the others are not asked.
+        # An effect may be active in few of the batch elements; evaluate only these.
         lanes = np.flatnonzero(on)
         own, begin = c[:, lanes], start[lanes]
         nothing = np.zeros_like(begin)
@@ -358,7 +385,7 @@ def _passed(
 
 
 def _before(ends: Array) -> Array:
-    """(L, S) the beginnings of steps, from their ends; shares memory as they do."""
+    """Return the beginnings (L, S) of steps from their ends; memory is shared as in `ends`."""
     own = ends[:1] if ends.strides[0] == 0 else ends
     start = np.zeros((len(own), 1))
     begin = np.concatenate([start, own[:, :-1]], axis=1)
@@ -366,8 +393,9 @@ def _before(ends: Array) -> Array:
 
 
 def _lasting(steps: Array) -> Indices:
-    """(L, S) for each step itself if it has a length, else the last before it that has: waiting
-    feels nothing new.
+    """Return the number (L, S) of each step, or of the last step before it with nonzero length.
+
+    The input does not change while a batch element waits.
     """
     own = np.arange(steps.shape[1])
     lasting = np.where(steps > 0, own, 0)
@@ -384,13 +412,24 @@ def _felt(
     alike: bool,
     other: bool = False,
 ) -> Array:
-    """Means (L, S) of each lane's signal from `begin` to `end` (L, S); of lanes that are alike only
-    the first of each run is looked at. With `other`, a signal that holds between samples goes
-    straight, and one that goes straight holds.
+    """Return the mean of each batch element's signal over each step.
+
+    Args:
+        runs: Scenarios of the batch elements.
+        name: Name of the input.
+        commands: Inputs of each distinct scenario.
+        begin: (L, S) beginnings of the steps, s.
+        end: (L, S) ends of the steps, s.
+        alike: Whether batch elements with the same scenario have the same steps, so that only the
+            first of them is evaluated.
+        other: Whether to interpolate held signals linearly, and to hold linear ones.
+
+    Returns:
+        Means (L, S).
     """
     count = len(commands) if alike else len(begin)
     result = np.empty((count, begin.shape[1]))
-    # All lanes of a run in one call.
+    # Process all batch elements with the same scenario in one call.
     by_run = np.argsort(runs.of, kind="stable")
     borders = np.flatnonzero(np.diff(runs.of[by_run])) + 1
     for lanes in np.split(by_run, borders):
@@ -405,15 +444,20 @@ def _felt(
 
 
 def _means(times: Array, values: Array, begin: Array, end: Array) -> Array:
-    """Means over [begin, end] of the signal that holds values[i] from times[i] on; its value where
-    begin = end.
+    """Return the means of a held signal over intervals; its value where an interval has no length.
+
+    Args:
+        times: (T,) times from which the values hold, s.
+        values: (T,) values.
+        begin: Beginnings of the intervals, s.
+        end: Ends of the intervals, s.
     """
     place = np.searchsorted(times, begin, side="right") - 1
     place = np.clip(place, 0, times.size - 1)
     value: Array = values[place]
     last = np.searchsorted(times, end, side="left") - 1
     last = np.clip(last, 0, times.size - 1)
-    # (1) only where the command changes within: elsewhere its value is exact, a quotient is not.
+    # Equation (1) only where the command changes within the interval; elsewhere its value is exact.
     crossing = last > place
     if crossing.any():
         held = values[:-1] * np.diff(times)
@@ -426,13 +470,20 @@ def _means(times: Array, values: Array, begin: Array, end: Array) -> Array:
 
 
 def _straight_means(times: Array, values: Array, begin: Array, end: Array) -> Array:
-    """The same of the signal that goes straight from values[i] at times[i] to the next, and is as
-    at its ends before and after.
+    """Return the means of a linearly interpolated signal over intervals.
+
+    The signal is constant before the first and after the last sample.
+
+    Args:
+        times: (T,) sample times, s.
+        values: (T,) values.
+        begin: Beginnings of the intervals, s.
+        end: Ends of the intervals, s.
     """
     halves = 0.5 * (values[:-1] + values[1:]) * np.diff(times)
     area = np.concatenate([[0.0], np.cumsum(halves)])
     value = np.interp(0.5 * (begin + end), times, values)
-    # A mean over part of one straight stretch is its middle; over more of them, (1).
+    # The mean over a part of one linear segment is its middle value; over several segments, (1).
     first = np.searchsorted(times, begin, side="right")
     crossing = np.searchsorted(times, end, side="left") > first
     if crossing.any():
@@ -444,7 +495,14 @@ def _straight_means(times: Array, values: Array, begin: Array, end: Array) -> Ar
 
 
 def _straight_area(times: Array, values: Array, area: Array, t: Array) -> Array:
-    """A(t) of (1) of a signal that goes straight, with `area` (T,) that up to each of `times`."""
+    """Return the integral A(t) of (1) of a linearly interpolated signal.
+
+    Args:
+        times: (T,) sample times, s.
+        values: (T,) values.
+        area: (T,) integral up to each of `times`.
+        t: Times, s.
+    """
     place = np.clip(np.searchsorted(times, t, side="right") - 1, 0, times.size - 1)
     here = np.interp(t, times, values)
     result: Array = area[place] + 0.5 * (values[place] + here) * (t - times[place])
@@ -452,7 +510,14 @@ def _straight_area(times: Array, values: Array, area: Array, t: Array) -> Array:
 
 
 def _area(times: Array, values: Array, area: Array, t: Array) -> Array:
-    """A(t) of (1), with `area` (T,) that up to each of `times` (T,)."""
+    """Return the integral A(t) of (1) of a held signal.
+
+    Args:
+        times: (T,) sample times, s.
+        values: (T,) values.
+        area: (T,) integral up to each of `times`.
+        t: Times, s.
+    """
     place = np.searchsorted(times, t, side="right") - 1
     place = np.clip(place, 0, times.size - 1)
     result: Array = area[place] + values[place] * (t - times[place])
@@ -460,13 +525,13 @@ def _area(times: Array, values: Array, area: Array, t: Array) -> Array:
 
 
 def _shifts(effect: Effect) -> bool:
-    """Whether it moves instants: whether it has a `times` of its own."""
+    """Return whether an effect shifts time, that is, overrides `times`."""
     if not isinstance(effect, (Input, Sensor)):
         return False
     return type(effect).times not in (Input.times, Sensor.times)
 
 
 def acts(c: Array) -> NDArray[np.bool_]:
-    """(L, 1) in which lanes an effect with coefficients (K, L, 1) is not off."""
+    """Return the mask (L, 1) of batch elements in which coefficients (K, L, 1) are not all zero."""
     result: NDArray[np.bool_] = (c != 0).any(axis=0)
     return result

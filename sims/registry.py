@@ -1,8 +1,8 @@
-"""Registered parts of one kind, by name: the project's own, installed plugins' and those added
-while the program runs.
+"""Registry of parts by name: built-in, installed, and added at run time.
 
-Installed parts come through an entry-point group and are imported only when asked for. What cannot
-be imported is listed as skipped, with the reason. Files and notebooks add theirs with `register`.
+Installed parts come from an entry-point group and are imported only when requested. Parts that
+cannot be imported are listed as skipped, with the reason. Files and notebooks add parts with
+`register`.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from sims.base import InputError, unknown
 T = TypeVar("T")
 
 _NAME = re.compile(r"[A-Za-z0-9][\w.+-]{0,60}$")
-"""What tables, file names and command lines can hold."""
+"""Pattern of names that are valid in tables, file names and command lines."""
 
 
 class SkippedError(InputError):
-    """A registered part cannot be used here.
+    """Registered part that cannot be used on this machine.
 
     Attributes:
-        reason: why, without the part's name; the message has both.
+        reason: Reason without the part's name; the message contains both.
     """
 
     def __init__(self, kind: str, name: str, reason: str) -> None:
@@ -39,27 +39,26 @@ class SkippedError(InputError):
         self._given = kind, name, reason
 
     def __reduce__(self) -> tuple[type[SkippedError], tuple[str, str, str]]:
-        # Worker processes hand errors over pickled, which calls the class with the message alone.
+        # Errors of worker processes are pickled; by default that would call the class with the
+        # message only.
         return SkippedError, self._given
 
 
 @dataclass(frozen=True)
 class Added(Generic[T]):
-    """A part that no installed package brings, and the file that it stands in; None for a class
-    from Python.
-    """
+    """Part that was added at run time, and its plugin file; None for a class from Python."""
 
     part: type[T]
     path: Path | None
 
 
 class Registry(Generic[T]):
-    """The registered parts of one kind.
+    """Registered parts of one kind.
 
     Args:
-        kind: what a message calls one of them, e.g. ``tuner``.
-        group: the entry-point group of installed ones.
-        base: the class they are derived from.
+        kind: Word for such a part in messages, e.g. ``tuner``.
+        group: Entry-point group of the installed parts.
+        base: Base class of the parts.
     """
 
     def __init__(self, kind: str, group: str, base: type[T]) -> None:
@@ -73,15 +72,15 @@ class Registry(Generic[T]):
         return {entry.name: entry for entry in entry_points(group=self.group)}
 
     def names(self) -> list[str]:
-        """All registered names, sorted."""
+        """Return all registered names, sorted."""
         return sorted({*self._entries, *self._announced, *self._added})
 
     def get(self, name: str) -> type[T]:
-        """The class registered as `name`.
+        """Return the class registered as `name`.
 
         Raises:
-            InputError: no such name.
-            SkippedError: it cannot be imported or lacks a package.
+            InputError: The name is unknown.
+            SkippedError: The part cannot be imported, or needs a missing package.
         """
         if name in self._added:
             part: Any = self._added[name].part
@@ -92,7 +91,7 @@ class Registry(Generic[T]):
         else:
             error = unknown(self.kind, name, self.names())
             raise InputError(f"{error}; one of your own needs its file: --plugin FILE.py")
-        # Looked for each time: a package may be installed while a notebook is open.
+        # Checked each time, because a package may be installed while a notebook is open.
         requires = getattr(part, "requires", ())
         missing = [package for package in requires if importlib.util.find_spec(package) is None]
         if missing:
@@ -103,11 +102,11 @@ class Registry(Generic[T]):
         return result
 
     def _installed(self, name: str) -> Any:
-        """What the entry point `name` leads to, imported once."""
+        """Load the entry point `name`; it is imported once."""
         if name not in self._imported:
             try:
                 part = self._entries[name].load()
-            except Exception as error:  # a plugin may fail in any way while it is imported
+            except Exception as error:  # a plugin may fail in any way during import
                 reason = f"{type(error).__name__}: {error}"
                 raise SkippedError(self.kind, name, reason) from error
             if not self.accepts(part):
@@ -117,7 +116,7 @@ class Registry(Generic[T]):
         return self._imported[name]
 
     def describe(self, name: str) -> str:
-        """One line for a list: what it is, or why it is skipped."""
+        """Return one line for a list: the description, or why the part is skipped."""
         try:
             part = self.get(name)
         except SkippedError as error:
@@ -126,22 +125,22 @@ class Registry(Generic[T]):
         return " ".join(says.split())
 
     def accepts(self, part: object) -> bool:
-        """Whether this is a class of this registry's kind."""
+        """Return whether an object is a class of this registry's kind."""
         return inspect.isclass(part) and issubclass(part, self.base)
 
     def register(self, part: type[T], path: Path | None = None) -> type[T]:
-        """Add a class; returns it, so that this serves as a decorator.
+        """Add a class and return it, so that this can be used as a decorator.
 
-        Registering a class again changes nothing. A class of the same qualified name takes the
-        place of one that was registered from Python: a notebook's cell was run again.
+        Registering a class again has no effect. A class replaces an earlier one of the same
+        qualified name that was registered from Python, as when a notebook's cell is run again.
 
         Args:
-            part: the class; registered under its `name`.
-            path: the plugin file that it stands in, if it does in one.
+            part: Class to register under its `name`.
+            path: Plugin file that contains it; None for a class from Python.
 
         Raises:
-            InputError: it is of another kind, its name is taken or none that tables, files and
-                command lines can hold.
+            InputError: The class is of another kind, or its name is taken or not usable in tables,
+                files and command lines.
         """
         where = f"plugin {path}: " if path else ""
         if not self.accepts(part) or inspect.isabstract(part):
@@ -150,7 +149,7 @@ class Registry(Generic[T]):
         name = _name_of(part, where)
         if self._holds(name, part):
             return part
-        # What was known of the file's part is known better now.
+        # The loaded class replaces the stub of the same file.
         if name in self._announced and self._announced[name].path == path:
             del self._announced[name]
         if name in self.names() and not self._may_replace(name, part, path):
@@ -159,14 +158,15 @@ class Registry(Generic[T]):
         return part
 
     def announce(self, part: type[T], path: Path | None) -> None:
-        """Let a name stand for a class whose code is not loaded into this process.
+        """Register a stub for a class whose code is not loaded into this process.
 
         Args:
-            part: what is known of it, as a class.
-            path: its plugin file; None where an installed package has it, whose place it takes.
+            part: Stub class with the known attributes.
+            path: Plugin file of the class; None for a class of an installed package, which is
+                replaced.
 
         Raises:
-            InputError: its name is taken or cannot be used.
+            InputError: The name is taken or not usable.
         """
         where = f"plugin {path}: " if path else ""
         name = _name_of(part, where)
@@ -177,37 +177,38 @@ class Registry(Generic[T]):
         self._announced[name] = Added(part, path)
 
     def entry(self, name: str) -> str | None:
-        """The ``module:class`` of an installed part; None where no package has one of that name."""
+        """Return the ``module:class`` of an installed part; None if no package has this name."""
         return self._entries[name].value if name in self._entries else None
 
     def place(self, name: str) -> Path | None:
-        """The plugin file of a part that came from one, loaded or only announced."""
+        """Return the plugin file of a loaded part or stub; None if it is not from a file."""
         added = self._added.get(name) or self._announced.get(name)
         return added.path if added else None
 
     def _holds(self, name: str, part: type[T]) -> bool:
-        """Whether the name stands for this very class."""
+        """Return whether this class is registered under the name."""
         if name in self._added:
             return self._added[name].part is part
         return name in self._entries and self._entries[name].value == ":".join(_qualified(part))
 
     def _may_replace(self, name: str, part: type[T], path: Path | None) -> bool:
-        """Whether what stands under the name is an earlier state of the class."""
+        """Return whether the registered class is an earlier version of this class."""
         old = self._added.get(name)
-        # Not so with files: two of one name in two folders give their classes one qualified name.
+        # Only classes from Python: files of the same name in two folders give equal qualified
+        # names.
         from_python = old is not None and old.path is None and path is None
         return old is not None and from_python and _qualified(old.part) == _qualified(part)
 
     def paths(self) -> set[Path]:
-        """The plugin files of all parts that came from one."""
+        """Return the plugin files of all loaded parts."""
         return {added.path for added in self._added.values() if added.path is not None}
 
     def snapshot(self) -> Mapping[str, Added[T]]:
-        """What has been added beside the installed parts, by name; for `restore`."""
+        """Return the parts added at run time by name, for `restore`."""
         return MappingProxyType(dict(self._added))
 
     def restore(self, snapshot: Mapping[str, Added[T]]) -> None:
-        """Forget what has been added since the snapshot, and take back what has been lost."""
+        """Restore the added parts of a snapshot, and remove later parts and all stubs."""
         self._added = dict(snapshot)
         self._announced = {}
 
@@ -217,10 +218,14 @@ def _qualified(part: type) -> tuple[str, str]:
 
 
 def _name_of(part: type, where: str) -> str:
-    """The name under which a class registers, its declaration checked.
+    """Check the declaration of a class, and return its name.
+
+    Args:
+        part: Class to register.
+        where: Beginning of the message.
 
     Raises:
-        InputError: it has none, or one that cannot be used; `where` begins the message.
+        InputError: The class has no name, or one that is not usable.
     """
     name = getattr(part, "name", None)
     if not (isinstance(name, str) and _NAME.match(name)):

@@ -1,4 +1,4 @@
-"""A simulator made of a system, an engine and effects: again a simulator, which any tuner tunes."""
+"""Simulator composed of a system, an engine and effects, which any tuner can tune."""
 
 from __future__ import annotations
 
@@ -34,30 +34,30 @@ from sims.tally import TALLY
 from sims.user_toml import shown
 
 BEYOND = 1e6
-"""Times its largest plausible value, a coefficient is a slip of the pen."""
+"""Factor of its largest plausible value above which a coefficient is refused as a mistake."""
 
 
 class Simulated(Simulator):
-    """Base of the simulators of declared systems; a subclass names its `system`.
+    """Base class of the simulators of declared systems; a subclass sets `system`.
 
     Args:
-        constants: values for `constants` other than their defaults.
-        observe: channels to return, in order (default: all).
-        engine: pybullet, mujoco or batch.
-        effects: effects whose coefficients are parameters, behind the system's own, in the order in
-            which a signal passes them: registered names, or classes that need no registering.
-        fixed: effects with known coefficients: a number, or a list where an effect has several.
-        settings: the engine's own, e.g. ``time_step``.
+        constants: Values of `constants` that differ from their defaults.
+        observe: Channels to return, in order (default: all).
+        engine: Name of the engine: pybullet, mujoco or batch.
+        effects: Effects whose coefficients are parameters after the system's own, in the order in
+            which a signal passes them: registered names, or classes, which need not be registered.
+        fixed: Effects with known coefficients: a number, or a list if an effect has several.
+        settings: Settings of the engine, e.g. ``time_step``.
 
     Raises:
-        InputError: an unknown name, an effect that the system cannot have, an engine that cannot
-            carry it.
+        InputError: A name is unknown, the system cannot have an effect, or the engine does not
+            support it.
     """
 
     system: ClassVar[type[System]]
     default_engine: ClassVar[str] = "batch"
     own_engine: ClassVar[bool] = False
-    """Whether it steps itself, so that there is no engine to choose."""
+    """Whether the simulator steps itself, so that no engine can be chosen."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class Simulated(Simulator):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        # A simulator says what its system says: it is declared once.
+        # The declaration is copied from the system.
         system = cls.system
         cls.name = system.name
         cls.says = system.says
@@ -112,7 +112,7 @@ class Simulated(Simulator):
 
     def _effect(self, named: str | type[Effect]) -> Effect:
         effect = library.find(named, self.system) if isinstance(named, str) else named
-        # An effect of a place is one that the system itself has made.
+        # Effects at a place are made by the system itself and need no check.
         if effect.of:
             return effect()
         if reason := effect.misses(self.system):
@@ -127,8 +127,14 @@ class Simulated(Simulator):
         return effect()
 
     def simulate(self, theta: Array, scenario: Scenario) -> Array:
-        """Simulate each row of `theta` (n, dim) in one scenario; returns (n, T, C). See
-        `Simulator.simulate`.
+        """Simulate each parameter vector in one scenario; see `Simulator.simulate`.
+
+        Args:
+            theta: Parameter vectors (n, dim), physical units.
+            scenario: Conditions of the run.
+
+        Returns:
+            Observations (n, T, C), SI units.
         """
         return self.simulate_lanes(theta, [scenario] * len(theta))
 
@@ -138,22 +144,22 @@ class Simulated(Simulator):
         scenarios: Sequence[Scenario],
         initial: Mapping[str, Array] | None = None,
     ) -> Array:
-        """Simulate each row of `theta` (L, dim) in its own scenario, all in one call of the engine.
+        """Simulate each parameter vector in its own scenario, all in one call of the engine.
 
-        Cheapest where lanes share scenario objects.
+        This is fastest if batch elements share scenario objects.
 
         Args:
-            theta: physical parameters, then coefficients of effects.
-            scenarios: one a lane.
-            initial: initial states (L,) by name, in place of the scenarios' own.
+            theta: Parameter vectors (L, dim): physical parameters, then coefficients of effects.
+            scenarios: Scenario of each batch element.
+            initial: Initial states (L,) by name, which replace those of the scenarios.
 
         Returns:
-            Observations (L, T, C), T that of the longest scenario; behind the end of a shorter one
-            stand NaN.
+            Observations (L, T, C), with T of the longest scenario; NaN after the end of a shorter
+            one.
 
         Raises:
-            InputError: a wrong shape, or a scenario that names a constant, input or state that the
-                system lacks.
+            InputError: A shape is wrong, or a scenario names a constant, input or state that the
+                system does not have.
         """
         theta = np.asarray(theta, dtype=np.float64)
         if theta.ndim != 2 or theta.shape != (len(scenarios), len(self.parameters)):
@@ -167,15 +173,15 @@ class Simulated(Simulator):
     def _simulated(
         self, theta: Array, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> Array:
-        """The same of one lane or more, checked."""
+        """Simulate at least one batch element with checked arguments."""
         acting = self._acting(theta)
         runs = make_runs(scenarios)
         commands = [self.run_inputs(s) for s in runs.distinct]
-        with np.errstate(all="ignore"):  # a lane whose numbers overflow is NaN in the end
+        with np.errstate(all="ignore"):  # batch elements that overflow become NaN
             plan = make_plan(runs, commands, _of(acting, (Input, Sensor)), self.engine.largest_step)
             inputs = felt_inputs(plan, runs, commands, _of(acting, Input)) if self.inputs else {}
             sensors = tuple((effect, c) for effect, c in _of(acting, Sensor) if c.any())
-            # A filter in a sensor sees every step; the others see the samples alone.
+            # A sensor filter needs every step; other sensor effects need the samples only.
             filtered = any(_filters(effect) for effect, _ in sensors)
             every = 1 if filtered else plan.every
             own = np.ascontiguousarray(theta[:, : len(self.system.parameters)])
@@ -185,21 +191,20 @@ class Simulated(Simulator):
             clock = np.array([s.times[0] for s in runs.distinct])[runs.of, None]
             motion = integrate(self.engine, lanes)
             observations = self._read(motion, lanes, plan, sensors, clock)
-        # A shorter run has waited at its end; what it showed there was no sample.
+        # Readings of a shorter run while it waits at its end are not samples.
         sizes = np.array([s.times.size for s in runs.distinct])
         if sizes.min() < sizes.max():
             observations[np.arange(sizes.max()) >= sizes[runs.of, None]] = np.nan
         return observations
 
     def close(self) -> None:
-        """Give back what the engine holds."""
+        """Release the resources of the engine."""
         self.engine.close()
 
     def _acting(self, theta: Array) -> Acting:
-        """Effects with their coefficients (K, L, 1): the tuned ones from `theta`, then the fixed
-        ones.
+        """Return the effects with their coefficients (K, L, 1): tuned ones, then fixed ones.
 
-        Those that the system does not have, or that were not given, are zero.
+        Coefficients that the system does not have, or that were not given, are zero.
         """
         acting = []
         place = len(self.system.parameters)
@@ -217,8 +222,8 @@ class Simulated(Simulator):
     def _known(
         self, scenarios: Sequence[Scenario], initial: Mapping[str, Array]
     ) -> tuple[dict[str, Array], Array, Array]:
-        """Constants (L, 1) by name, initial positions and velocities (L, D)."""
-        # Checked once for each scenario object and not for each lane: there are hundreds of lanes.
+        """Return constants (L, 1) by name, and initial positions and velocities (L, D)."""
+        # Check each scenario object once, not each of hundreds of batch elements.
         distinct, of = by_object(scenarios)
         known = [self.run_constants(s) for s in distinct]
         began = [self.run_initial(s) for s in distinct]
@@ -232,44 +237,65 @@ class Simulated(Simulator):
     def _read(
         self, motion: Motion, lanes: Lanes, plan: Plan, sensors: Acting, clock: Array
     ) -> Array:
-        """What the sensors record: (L, T, C); `clock` (L, 1) is the first stamp of each run."""
+        """Return the sensor readings of a simulation.
+
+        Args:
+            motion: Result of the engine.
+            lanes: Work of the engine.
+            plan: Time grid.
+            sensors: Active sensor effects.
+            clock: (L, 1) first time stamp of each run, s.
+
+        Returns:
+            Observations (L, T, C).
+        """
         channels = self._declared.observe(motion.x, motion.v, motion.a, lanes.constants)
         names = [c.name for c in self.channels]
         valued = self.system.reading(names)
         times = _kept(plan, lanes.every)
         steps = np.diff(times, axis=1, prepend=0.0)
-        # The plan's rows count samples; more states than that are kept where a sensor filters.
+        # Convert the rows: with a sensor filter, more states than the samples are stored.
         rows = plan.rows * (plan.every // lanes.every)
         observations = np.empty((*rows.shape, len(names)))
         for place, name in enumerate(names):
             values = channels[name]
-            # A gain or bias is that of one channel.
+            # A gain or bias affects one channel only.
             reading = tuple((e, c) for e, c in sensors if _filters(e) or name == valued)
             if reading:
                 values = sensed(reading, values, steps, times, clock)
             observations[:, :, place] = _chosen(values, rows)
-        observations += 0.0  # no zero is negative: whatever made it, it is the same zero
+        observations += 0.0  # turn negative zeros into positive ones
         return observations
 
 
 def _filters(effect: Effect) -> bool:
-    """Whether a sensor's effect must see every step."""
+    """Return whether an effect is a sensor effect that needs every step."""
     return isinstance(effect, Sensor) and effect.filters
 
 
 def sensed(
     sensors: Acting, values: Array, steps: Array, times: Array, clock: Array | float = 0.0
 ) -> Array:
-    """(L, R) what sensors in a row make of a channel's values (L, R).
+    """Apply sensor effects one after another to a channel.
 
-    Each reads what the one before gives, also at the start, in which the next begins.
+    Each effect gets the output of the previous one, also for the value at the start.
+
+    Args:
+        sensors: Sensor effects with their coefficients.
+        values: (L, R) values of the channel.
+        steps: (L, R) lengths of the steps before the values, s.
+        times: (L, R) times of the values since the start, s.
+        clock: (L, 1) first time stamp of each run, s.
+
+    Returns:
+        Readings (L, R).
     """
     values = values.copy()
     start = values[:, :1].copy()
     clock = np.broadcast_to(clock, start.shape)
     for effect, c in sensors:
         assert isinstance(effect, Sensor)
-        # Of hundreds of lanes an effect may act in a few: the others are not asked.
+        # An effect may be active in few of the batch elements; evaluate only these.
         lanes = np.flatnonzero(acts(c))
         own, begin = c[:, lanes], start[lanes]
         nothing = np.zeros_like(begin)
@@ -281,13 +307,13 @@ def sensed(
 
 
 def _kept(plan: Plan, every: int) -> Array:
-    """(L, R) instants of the states that an engine keeps, in seconds since the start."""
+    """Return the times (L, R) since the start of the states that the engine stores, s."""
     start = np.zeros((len(plan.ends), 1))
     return np.concatenate([start, plan.ends[:, every - 1 :: every]], axis=1)
 
 
 def _chosen(values: Array, rows: NDArray[np.intp]) -> Array:
-    """values[l, rows[l, t]], without a copy where all of the first values are chosen."""
+    """Return values[l, rows[l, t]], without a copy if the first values are selected in order."""
     in_order = (rows[:1] == np.arange(rows.shape[1])).all()
     if in_order and (rows.strides[0] == 0 or (rows == rows[:1]).all()):
         return values[:, : rows.shape[1]]
@@ -298,8 +324,12 @@ def _chosen(values: Array, rows: NDArray[np.intp]) -> Array:
 def effect_parameters(
     effect: Effect | type[Effect], system: type[System], observed: Sequence[str] = ()
 ) -> tuple[Parameter, ...]:
-    """The coefficients of an effect as parameters, named for the effect and searched in their
-    plausible range.
+    """Return the coefficients of an effect as parameters with their plausible ranges as bounds.
+
+    Args:
+        effect: Effect.
+        system: System on which it acts.
+        observed: Names of the observed channels, which may determine units; all if empty.
     """
     result = []
     there = effect.on(system)
@@ -307,18 +337,18 @@ def effect_parameters(
         name = effect.name if len(there) == 1 else f"{effect.name}.{c.name}"
         low, high = c.range(system.kind)
         unit = c.unit_on(system, observed) or ""
-        off = min(max(0.0, low), high)  # nominally it is not there, if that is in its range
+        off = min(max(0.0, low), high)  # zero, or the nearest value of the range
         result.append(Parameter(name, unit, off, (low, high), says=effect.says))
     return tuple(result)
 
 
 def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, Array]:
-    """Rows of numbers by name as one array (N,) a name."""
+    """Convert rows of numbers by name to one array (N,) per name."""
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 def _stacked(states: Mapping[str, Array], names: Sequence[str], count: int) -> Array:
-    """The states of these names as columns (L, D)."""
+    """Return the states with these names as columns (L, D)."""
     if not names:
         return np.empty((count, 0))
     columns = [np.broadcast_to(states[name], (count,)) for name in names]
@@ -327,10 +357,10 @@ def _stacked(states: Mapping[str, Array], names: Sequence[str], count: int) -> A
 
 
 def _check_given(effects: object, fixed: object) -> None:
-    """Refuse what an experiment's file may hold in place of names and a table.
+    """Check the types of effects and fixed coefficients, which may come from an experiment's file.
 
     Raises:
-        InputError: it does.
+        InputError: A type is wrong.
     """
     if not isinstance(effects, list | tuple) or not all(map(_names_effect, effects)):
         raise InputError(f"effects: expected a list of names, found {shown(effects)}")
@@ -344,7 +374,7 @@ def _names_effect(value: object) -> bool:
 
 
 def _row(name: str, value: Any) -> tuple[float, ...]:
-    """The coefficients of a fixed effect, one or several."""
+    """Return the coefficients of a fixed effect as a tuple."""
     several = isinstance(value, list | tuple)
     values = tuple(value) if several else (value,)
     if not all(map(is_number, values)):
@@ -353,10 +383,10 @@ def _row(name: str, value: Any) -> tuple[float, ...]:
 
 
 def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) -> None:
-    """Refuse coefficients beyond all that can be meant.
+    """Check that coefficients have plausible sizes.
 
     Raises:
-        InputError: one is.
+        InputError: A coefficient is too large.
     """
     for coefficient, value in zip(effect.on(system), values, strict=False):
         largest = max(map(abs, coefficient.range(system.kind)))
@@ -368,7 +398,7 @@ def _check_sizes(effect: Effect, system: type[System], values: Sequence[float]) 
 
 
 def _coefficients(effect: Effect, rows: Array) -> Array:
-    """`rows` (k, L) as (K, L, 1), the coefficients behind the first k zero."""
+    """Extend coefficients `rows` (k, L) to (K, L, 1) with zeros."""
     result = np.zeros((len(effect.coefficients), rows.shape[1], 1))
     result[: len(rows), :, 0] = rows
     return result

@@ -1,18 +1,19 @@
-"""What a system is, what an effect gives to it, what an engine integrates: the seam between the
-three.
+"""Interfaces of systems, effects and engines.
 
 A *system* is declared once (`System`): names, units, and its generalised forces as array functions.
-An *engine* integrates it (`Engine`), many lanes at once. An *effect* (`Effect`) adds one
-contribution through one hook. None of them knows the others' insides: they meet in `Moment`, the
-instant at which forces are asked for, and in `Lanes`, the work for an engine.
+An *engine* integrates it (`Engine`), many batch elements at once. An *effect* (`Effect`) adds one
+contribution through one hook. They are independent of each other's implementation and communicate
+through `Moment`, the state at which forces are evaluated, and `Lanes`, the work for an engine.
 
-Shapes: L lanes (a parameter vector in a run), D coordinates, S steps, K coefficients. Per-lane
-numbers are (L, 1), so that they multiply generalised vectors (L, D) as they stand. With the mass M,
-the drive U and what it works against, P (gravity alone in most systems: `passive`),
+Shapes: L batch elements (each a parameter vector in a run), D coordinates, S steps, K coefficients.
+Numbers per batch element are (L, 1), so that they can be multiplied with generalised vectors
+(L, D). With the mass M, the drive U and the passive force P that it works against (gravity alone in
+most systems: `passive`),
 
     M x'' = U(x, v, u) - P(x, v) + forces of effects                       (1)
 
-less dry friction, which is added up over its effects and opposes the motion as one force.
+minus dry friction, whose limits are added over all effects and which opposes the motion as one
+force.
 """
 
 from __future__ import annotations
@@ -29,29 +30,29 @@ import numpy as np
 from sims.base import Array, Channel, Constant, Parameter
 
 Kind = Literal["point", "linear", "rotary"]
-"""How a system counts force: `point` per unit mass (m/s^2), `linear` in N, `rotary` in N*m."""
+"""Unit of a system's forces: `point` per unit mass (m/s^2), `linear` in N, `rotary` in N*m."""
 KINDS: tuple[Kind, ...] = ("point", "linear", "rotary")
 """All kinds, in the order of a coefficient's units and ranges."""
 PlaceKind = Literal["joint", "actuator", "body", "channel", "world", "level"]
-"""Kinds of places in a robot, and of an own simulator the levels."""
+"""Kinds of places where an effect acts; `level` exists only in user-defined simulators."""
 FAMILY = "*"
-"""The place of an effect that acts at all places of its kind."""
+"""Place of an effect that acts at all places of its kind."""
 STANDARD_GRAVITY = 9.80665
-"""m/s^2 (3rd General Conference on Weights and Measures, 1901)."""
+"""Standard gravity in m/s^2 (3rd General Conference on Weights and Measures, 1901)."""
 
 
 @dataclass
 class Moment:
-    """One instant of every lane, as effects see it.
+    """State of all batch elements at one time, for the evaluation of effects.
 
     Attributes:
-        system: whose moment it is.
-        theta: (L, p) the system's own parameters.
-        constants: known numbers of each lane, (L, 1) by name.
-        t: (L, 1) seconds since the start of the run.
+        system: System to which the state belongs.
+        theta: (L, p) parameters of the system itself.
+        constants: Known numbers of each batch element, (L, 1) by name.
+        t: (L, 1) time since the start of the run, s.
         x: (L, D) generalised position.
         v: (L, D) generalised velocity.
-        inputs: inputs as the plant feels them, (L, 1) by name.
+        inputs: Inputs applied to the plant, (L, 1) by name.
     """
 
     system: System
@@ -64,8 +65,8 @@ class Moment:
 
     @property
     def speed(self) -> Array:
-        """(L, 1) magnitude of the velocity."""
-        # Exact in one dimension, where the root of a square would round and underflow.
+        """Magnitude of the velocity (L, 1)."""
+        # Exact in one dimension, where the root of a square would be rounded and could underflow.
         if self.v.shape[1] == 1:
             return np.abs(self.v)
         speed: Array = np.sqrt((self.v * self.v).sum(axis=1, keepdims=True))
@@ -73,52 +74,51 @@ class Moment:
 
     @property
     def gravity(self) -> Array:
-        """(L, 1) m/s^2; the standard value where the system states none."""
+        """Gravitational acceleration (L, 1), m/s^2; standard gravity if the system states none."""
         return self.constants.get("gravity", np.full((len(self.x), 1), STANDARD_GRAVITY))
 
     @property
     def weight(self) -> Array:
-        """(L, D) generalised force of gravity."""
+        """Generalised force (L, D) of gravity."""
         return self.system.weight(self)
 
     def push(self, axis: Literal["x", "y"]) -> Array:
-        """(L, D) generalised force of one m/s^2 of horizontal acceleration of everything, along
-        `axis`.
-        """
+        """Return the generalised force (L, D) of a horizontal 1 m/s^2 acceleration along `axis`."""
         return self.system.push(self, axis)
 
     @property
     def load(self) -> Array:
-        """(L, 1) what a transmission carries: the drive from one side plus what it works against
-        from the other.
-        """
+        """Load (L, 1) of the transmission: magnitude of drive force plus passive force."""
         carried = self.system.drive(self) + self.system.passive(self)
         load: Array = np.abs(carried).sum(axis=1, keepdims=True)
         return load
 
     @property
     def sides(self) -> tuple[Array, Array]:
-        """(L, 1) each, of the primary coordinate: the force of the drive, and what it works
-        against; both press on the transmission where they have one sign.
+        """Drive force and passive force of the primary coordinate, each (L, 1).
+
+        With equal signs, they press on the transmission from both sides.
         """
         place = slice(self.system.primary, self.system.primary + 1)
         return self.system.drive(self)[:, place], self.system.passive(self)[:, place]
 
     @property
     def drawn(self) -> Array:
-        """(L, 1) sizes of the forces of all drives that share the supply of this one."""
+        """Sum of the force magnitudes (L, 1) of all drives that share a power supply."""
         drawn: Array = np.abs(self.sides[0])
         return drawn
 
     @property
     def error(self) -> Array:
-        """(L, 1) of the servo: how far its set point is from where it is."""
+        """Error of the servo (L, 1): set point minus position."""
         error: Array = self.inputs[self.system.servo] - self.primary
         return error
 
     def aimed(self, shift: Array) -> Array:
-        """(L, D) what the drive would exert more if its servo's set point were moved by `shift`
-        (L, 1).
+        """Return the change of the drive's force (L, D) if the servo's set point is shifted.
+
+        Args:
+            shift: (L, 1) shift of the set point.
         """
         name = self.system.servo
         moved = replace(self, inputs={**self.inputs, name: self.inputs[name] + shift})
@@ -127,23 +127,21 @@ class Moment:
 
     @property
     def inertia(self) -> Array:
-        """(L, 1) generalised inertia."""
+        """Generalised inertia (L, 1)."""
         return self.system.mass(self.theta, self.constants)
 
     @property
     def primary(self) -> Array:
-        """(L, 1) the coordinate that biases, springs and ripples act on."""
+        """Position (L, 1) of the primary coordinate, on which biases, springs and ripples act."""
         return self.x[:, self.system.primary, None]
 
     @property
     def primary_rate(self) -> Array:
-        """(L, 1) velocity of that coordinate."""
+        """Velocity (L, 1) of the primary coordinate."""
         return self.v[:, self.system.primary, None]
 
     def along_primary(self, force: Array) -> Array:
-        """(L, D) generalised force: `force` (L, 1) along the primary coordinate, zero along the
-        others.
-        """
+        """Return the generalised force (L, D) with `force` (L, 1) along the primary coordinate."""
         result = np.zeros_like(self.x)
         result[:, self.system.primary] = force[:, 0]
         return result
@@ -151,14 +149,14 @@ class Moment:
 
 @dataclass(frozen=True)
 class UsualRecording:
-    """What a simulated recording of a system shows where the user does not say.
+    """Default content of a simulated recording of a system.
 
     Attributes:
-        observe: channels to record; all that the system has where empty.
-        initial: by state, the lowest and the highest value from which each run draws, SI units; a
-            state that is not named begins at its default.
-        inputs: by input, the text of a signal (`bench.problem.signals`), as ``steps:2:0.5``; an
-            input that is not named is zero.
+        observe: Channels to record; all of the system if empty.
+        initial: Range by state, SI units, from which the initial state of each run is drawn; other
+            states begin at their default.
+        inputs: Text of a signal by input (`bench.problem.signals`), such as ``steps:2:0.5``; other
+            inputs are zero.
     """
 
     observe: tuple[str, ...] = ()
@@ -166,21 +164,21 @@ class UsualRecording:
     inputs: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        # One declaration serves every recording of the process: nobody may write into it.
+        # One declaration is shared by all recordings of the process, so it must be read-only.
         object.__setattr__(self, "initial", MappingProxyType(dict(self.initial)))
         object.__setattr__(self, "inputs", MappingProxyType(dict(self.inputs)))
 
 
 @dataclass(frozen=True)
 class Derived:
-    """A number that follows from a system's parameters and constants, and that people ask for.
+    """Quantity of interest that is computed from a system's parameters and constants.
 
     Attributes:
-        name: what it is called.
-        unit: of it.
-        says: what it is, in a few words.
-        of: of parameters and constants by name.
-        strongest: whether it is the force of the drive at its limit, at rest.
+        name: Name of the quantity.
+        unit: Unit of the quantity.
+        says: Description in a few words.
+        of: Function of parameters and constants by name that computes it.
+        strongest: Whether it is the maximum force of the drive at rest.
     """
 
     name: str
@@ -192,14 +190,14 @@ class Derived:
 
 @dataclass(frozen=True)
 class ModelFile:
-    """A system as a robot's model file.
+    """System in the form of a robot's model file.
 
     Attributes:
-        text: MJCF.
-        joint: its joint.
-        actuator: what drives that.
-        signals: channels and inputs of the robot, by the system's.
-        said: what the file cannot say, a clause each.
+        text: Content in MJCF.
+        joint: Name of the joint.
+        actuator: Name of the actuator that drives the joint.
+        signals: Channels and inputs of the robot, by those of the system.
+        said: Properties that the file cannot express, one clause each.
     """
 
     text: str
@@ -210,37 +208,37 @@ class ModelFile:
 
 
 class System(ABC):
-    """A physical system, declared once for every engine.
+    """Physical system, declared once for all engines.
 
     Attributes:
-        kind: how it counts force.
-        parameters: what may be tuned.
-        constants: known numbers with their defaults.
-        inputs: signals it takes; effects on the input act on the first.
-        channels: what its sensors can give; effects on a sensor's value act on the first one
-            observed of `sensed`.
-        coordinates: state names of the generalised position, in order.
-        rates: state names of the generalised velocity, in order.
-        states: defaults of both.
-        bounces: whether its last coordinate strikes ground at `floor`.
-        afloat: units by name of the states that are poses and velocities of bodies that float, and
-            no coordinates: where a run begins with them is known, and where a part of one does is
-            not.
-        sensed: channels that sensor effects may act on, in order of preference.
-        primary: index of the coordinate that biases and springs act on.
-        servo: input that is the set point of a servo's primary coordinate; empty where none is.
-        uniform: whether its own force is the same everywhere and always, so that it moves along
-            parabolas.
-        bends: whether its own force may bend sharply, so that steps are shortened where it does.
-        fastest: rad/s with which it may swing where a look at its forces does not show it; its
-            steps are divided for that, too.
-        guided: how many coordinates, the first ones, dry friction acts on; 0 for all.
-        has_model: whether it comes from a model file, whose numbers may be wrong.
-        levels: states that are stores, such as a tank's level: they may spill over.
-        usual_recording: what its simulated recordings show where the user does not say.
-        derived: numbers that follow from others, for a data sheet.
-        left_out: effects that it would have and cannot simulate, with the reason, by name. Whatever
-            asks for all effects (`sims.effects.library`) fills it.
+        kind: Unit of its forces.
+        parameters: Tunable parameters.
+        constants: Known numbers with their defaults.
+        inputs: Input signals; effects on the input act on the first.
+        channels: Signals that its sensors can measure; effects on a sensor's value act on the first
+            observed one of `sensed`.
+        coordinates: Names of the states that are the generalised position, in order.
+        rates: Names of the states that are the generalised velocity, in order.
+        states: Default values of both.
+        bounces: Whether its last coordinate strikes the ground at `floor`.
+        afloat: Units by name of the poses and velocities of floating bodies, which are states but
+            no coordinates: they are known at the beginning of a run, but not at the beginning of a
+            part of a run.
+        sensed: Channels on which sensor effects may act, in order of preference.
+        primary: Index of the coordinate on which biases and springs act.
+        servo: Input that is the set point of the servo of the primary coordinate; empty if there is
+            none.
+        uniform: Whether its own force is constant in space and time, so that it moves on parabolas.
+        bends: Whether its own force may change sharply, so that steps must be shortened there.
+        fastest: Maximum angular frequency in rad/s of oscillations that are not visible in its
+            forces; steps are divided for it, too.
+        guided: Number of coordinates, from the first one, on which dry friction acts; 0 for all.
+        has_model: Whether it comes from a model file, whose numbers may be wrong.
+        levels: States that are stored quantities, such as a tank's level, which may overflow.
+        usual_recording: Default content of its simulated recordings.
+        derived: Quantities computed from others, for a data sheet.
+        left_out: Effects that it would have but cannot simulate, with the reason, by name. It is
+            filled when all effects are requested (`sims.effects.library`).
     """
 
     name: ClassVar[str]
@@ -270,67 +268,82 @@ class System(ABC):
 
     @classmethod
     def reading(cls, observed: Sequence[str]) -> str:
-        """The channel among those `observed` whose value sensor effects act on."""
+        """Return the channel among those `observed` on whose value sensor effects act."""
         return next((name for name in cls.sensed if name in observed), observed[0])
 
     @classmethod
     def model_file(cls, numbers: Mapping[str, float]) -> ModelFile | None:  # noqa: ARG003
-        """The system as a robot's model file, with these parameters and constants by name; None
-        where it has no such form.
+        """Return the system as a robot's model file; None if that is not possible.
+
+        Args:
+            numbers: Parameters and constants by name.
         """
         return None
 
     @classmethod
     def gear(cls, coordinate: int) -> float:  # noqa: ARG003
-        """By how much its servo turns for each unit of a coordinate."""
+        """Return the gear ratio: the servo's travel per unit of a coordinate."""
         return 1.0
 
     @classmethod
     def placed(cls, effect: type[Effect]) -> Sequence[type[Effect]]:
-        """The registered effect where this system can have it: itself in a system of one place, a
-        class for each place and family in a robot; empty where it cannot.
+        """Return the forms of a registered effect that this system can have; empty if none.
+
+        This is the effect itself in a system with one place, and a class for each place and family
+        in a robot.
         """
         return (effect,) if effect.fits(cls) else ()
 
     @classmethod
     def effect(cls, name: str) -> type[Effect] | None:  # noqa: ARG003
-        """The effect of a name that only this system knows, as those of its places; None for what
-        is registered.
+        """Return the effect with a name that only this system defines, such as those of its places.
+
+        The result is None for registered effects.
         """
         return None
 
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:  # noqa: ARG003
-        """Why it cannot have an effect although it has all that the effect `needs`; empty if it
-        can.
+        """Return why the system cannot have an effect although it has all that the effect `needs`.
+
+        The result is empty if it can.
         """
         return ""
 
     @abstractmethod
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """(L, 1) generalised inertia; 1 for a system that counts force per unit mass."""
+        """Return the generalised inertia (L, 1); 1 for a system that counts force per unit mass.
+
+        Args:
+            theta: (L, p) parameters.
+            constants: Constants (L, 1) by name.
+        """
 
     @abstractmethod
     def weight(self, moment: Moment) -> Array:
-        """(L, D) generalised force of gravity."""
+        """Return the generalised force (L, D) of gravity."""
 
     def drive(self, moment: Moment) -> Array:
-        """(L, D) generalised force of the inputs, through the actuator."""
+        """Return the generalised force (L, D) of the inputs, applied by the actuator."""
         return np.zeros_like(moment.x)
 
     def passive(self, moment: Moment) -> Array:
-        """(L, D) minus every generalised force of the system that is not the drive: what the drive
-        works against.
+        """Return minus all generalised forces (L, D) of the system except the drive.
+
+        This is the force that the drive works against.
         """
         return -self.weight(moment)
 
     def force(self, moment: Moment) -> Array:
-        """(L, D) generalised force of the system itself, without effects."""
+        """Return the generalised force (L, D) of the system itself, without effects."""
         return self.drive(moment) - self.passive(moment)  # (1)
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
-        """(L, D) generalised force of one m/s^2 of horizontal acceleration along `axis`; zero where
-        it has none.
+        """Return the generalised force (L, D) of a horizontal acceleration of 1 m/s^2.
+
+        Args:
+            moment: State of all batch elements.
+            axis: Direction of the acceleration.
         """
         raise NotImplementedError
 
@@ -338,25 +351,31 @@ class System(ABC):
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """Channels (L, S) by name from positions, velocities, accelerations (L, S, D); constants
-        are (L, 1).
+        """Return the channels (L, S) by name.
+
+        Args:
+            x: (L, S, D) positions.
+            v: (L, S, D) velocities.
+            a: (L, S, D) accelerations.
+            constants: Constants (L, 1) by name.
         """
 
     def floor(self, constants: Mapping[str, Array]) -> Array:
-        """(L, 1) value of the last coordinate at which it strikes the ground."""
+        """Return the value (L, 1) of the last coordinate at which it strikes the ground."""
         raise NotImplementedError
 
     def restitution(self, theta: Array) -> Array:
-        """(L, 1) restitution at an impact."""
+        """Return the restitution (L, 1) of an impact."""
         raise NotImplementedError
 
     def friction(self, constants: Mapping[str, Array]) -> Array | None:  # noqa: ARG002
-        """(L, 1) friction coefficient of the ground itself, without effects; None for none."""
+        """Return the friction coefficient (L, 1) of the ground without effects; None for none."""
         return None
 
     def grip(self, constants: Mapping[str, Array]) -> Array | None:  # noqa: ARG002
-        """(L, 1) largest share of tangential speed that an impact takes, less than 1 where the body
-        spins up.
+        """Return the maximum share (L, 1) of tangential speed that an impact removes.
+
+        It is less than 1 where the body begins to roll; None for no such limit.
         """
         return None
 
@@ -376,29 +395,28 @@ Of = Literal[
     "give",
     "rotor",
 ]
-"""Whose unit a coefficient has, or what it is of."""
+"""Quantity from which the unit of a coefficient is derived, or the meaning of a coefficient."""
 
 
 @dataclass(frozen=True)
 class Coefficient:
-    """A number of an effect, zero where the effect is off.
+    """Number of an effect, zero where the effect is off.
 
     Attributes:
-        name: ``coefficient`` where the effect has only one.
-        units: for a point (per unit mass), linear and rotary system; None where the effect does not
-            exist there.
-        plausible: the range one would expect, in the same order.
-        of: whose unit it has where `units` are only the usual ones: ``input`` the first input's,
-            ``error`` the same, where it is compared with a servo's error, ``reading`` that of the
-            channel it acts on, ``input/s`` and ``reading/s`` the same per second,
-            ``input/s^2`` per second and second; ``level`` that of what is stored; ``stop`` is the
-            stiffness of one that stands where coefficient ``place`` says; ``drive`` is a limit of
-            the drive's force and ``travel`` a part of the way that it goes, with units of their
-            own; ``give`` is how far something yields to a force; ``rotor`` is an inertia that a
-            model file may state itself.
-        least: what a fit may not go below, where that is not a matter of plausibility.
-        most: what it may not exceed, likewise.
-        tried: sizes from which a search for it begins, where evenly spread ones would be too many.
+        name: Name; ``coefficient`` if the effect has only one.
+        units: Units for a point (per unit mass), linear and rotary system; None where the effect
+            does not exist.
+        plausible: Plausible ranges, in the same order.
+        of: Quantity whose unit it has, if `units` are only the default ones: ``input`` the first
+            input, ``error`` likewise for values compared with a servo's error, ``reading`` the
+            channel on which it acts, ``input/s`` and ``reading/s`` per second, ``input/s^2`` per
+            second squared, ``level`` the stored quantity. Other values state a meaning: ``stop`` is
+            the stiffness of a stop at the position given by coefficient ``place``; ``drive`` is a
+            limit of the drive's force and ``travel`` a part of its travel, with units of their own;
+            ``give`` is a compliance; ``rotor`` is an inertia that a model file may state itself.
+        least: Lower bound of a fit that is not a matter of plausibility; None for none.
+        most: Upper bound of a fit that is not a matter of plausibility; None for none.
+        tried: Values at which a search for it begins, if an evenly spaced grid would be too large.
     """
 
     name: str
@@ -410,12 +428,15 @@ class Coefficient:
     tried: tuple[float, ...] = ()
 
     def unit(self, kind: Kind) -> str | None:
-        """The unit on systems of this kind; None where the effect does not exist there."""
+        """Return the unit on systems of this kind; None if the effect does not exist there."""
         return self.units[KINDS.index(kind)]
 
     def unit_on(self, system: System | type[System], observed: Sequence[str] = ()) -> str | None:
-        """The unit on this system, of whose channels those named `observed` are recorded (default:
-        all).
+        """Return the unit on this system; None if the effect does not exist there.
+
+        Args:
+            system: System on which the effect acts.
+            observed: Names of the recorded channels (default: all).
         """
         if system.has_model:
             return self.unit(system.kind)
@@ -427,39 +448,40 @@ class Coefficient:
         return self.unit(system.kind)
 
     def range(self, kind: Kind) -> tuple[float, float]:
-        """The plausible range on systems of this kind."""
+        """Return the plausible range on systems of this kind."""
         return self.plausible[KINDS.index(kind)]
 
 
 class Effect(ABC):
-    """One physical cause that a simulator may lack. Subclass one of the hooks below, not this.
+    """Physical cause that a simulator may lack. Subclass one of the hook classes below instead.
 
-    A coefficient vector `c` comes as (K, L, 1): ``c[0]`` is the first coefficient of every lane.
+    A coefficient vector `c` has the shape (K, L, 1): ``c[0]`` is the first coefficient of all batch
+    elements.
 
     Attributes:
-        name: ``family.form``.
-        noun: what a report calls it, with its article, such as ``linear drag`` or ``a sensor
-            bias``; without one its name and the beginning of `says` stand there.
-        says: one sentence that a person understands, as the end of "the data say that ...".
-        source: where the law stands.
-        coefficients: its numbers; all zero is off, and must change nothing, bit for bit. Those that
-            a kind of system does not have come last and stay zero there; a kind that lacks the
-            first lacks the effect.
-        needs: what the system must have: ``input``; ``ground`` to strike; ``guide``, which a body
-            that flies freely lacks; ``joint``, one alone; ``servo``, an input that is a set point;
-            ``gravity``; ``push``, a say in what horizontal acceleration does to it; ``space`` of
-            three dimensions; ``model``, a file that states its numbers; ``level``, something that
-            it stores;
-            or empty.
-        contains: simpler effects that it turns into where some of its coefficients are zero.
-        hook: which of the engine's hooks it uses; set by the hook classes.
-        sharp: whether it begins and ends at a place, within a step: it is followed in finer steps.
-        at: of what kind its places in a robot are.
-        place: of a robot: the joint, actuator, body or channel where it acts; ``*`` of a family;
-            empty for an effect of the world and in systems of one place.
-        coordinate: which coordinate it acts on; None for the system's primary one.
-        signal: the input or channel that it acts on; empty for the first, or for all.
-        of: name of the effect that it is at a place.
+        name: Name, ``family.form``.
+        noun: Noun with article for reports, such as ``linear drag`` or ``a sensor bias``; if empty,
+            the name and the beginning of `says` are used.
+        says: Description in one sentence, as the end of "the data say that ...".
+        source: Reference for the law.
+        coefficients: Its numbers; if all are zero, the effect is off and must not change anything,
+            bit for bit. Those that a kind of system does not have come last and remain zero there;
+            a kind that lacks the first one lacks the effect.
+        needs: Property that the system must have: ``input``; ``ground`` that it strikes; ``guide``,
+            which a freely flying body lacks; ``joint``, a single one; ``servo``, an input that is a
+            set point; ``gravity``; ``push``, the response to horizontal acceleration; ``space``,
+            three dimensions; ``model``, a file that states its numbers; ``level``, a stored
+            quantity; or empty.
+        contains: Simpler effects to which it reduces if some of its coefficients are zero.
+        hook: Hook of the engine that it uses; set by the hook classes.
+        sharp: Whether it begins and ends at a position within a step, so that finer steps are
+            needed.
+        at: Kind of its places in a robot.
+        place: Place in a robot: the joint, actuator, body or channel where it acts; ``*`` for a
+            family; empty for an effect of the world and in systems with one place.
+        coordinate: Coordinate on which it acts; None for the system's primary one.
+        signal: Input or channel on which it acts; empty for the first, or for all.
+        of: Name of the registered effect of which it is a form at one place.
     """
 
     name: ClassVar[str]
@@ -478,23 +500,37 @@ class Effect(ABC):
     of: ClassVar[str] = ""
 
     def parts(self, c: Array) -> Acting:
-        """The effect as the sum of effects at one place each, with their coefficients (K, L, 1)."""
+        """Return the effect as the sum of effects at one place each.
+
+        Args:
+            c: Coefficients (K, L, 1).
+
+        Returns:
+            The effects with their coefficients.
+        """
         return ((self, c),)
 
     def taking(self, c: Array, simpler: str, given: Array) -> Array:  # noqa: ARG002
-        """Coefficients (k,) that do besides what a simpler effect that it contains, which it is to
-        stand for, does with those `given`, as far as one of them says so.
+        """Return coefficients that include a simpler effect, which this effect replaces.
+
+        Args:
+            c: (k,) coefficients of this effect.
+            simpler: Name of the simpler effect, one of `contains`.
+            given: Coefficients of the simpler effect.
+
+        Returns:
+            Coefficients (k,); the default implementation returns `c` unchanged.
         """
         return c
 
     @classmethod
     def fits(cls, system: System | type[System]) -> bool:
-        """Whether the system can have this effect."""
+        """Return whether the system can have this effect."""
         return not cls.misses(system)
 
     @classmethod
     def misses(cls, system: System | type[System]) -> str:
-        """What keeps the system from having this effect; empty if it can have it."""
+        """Return why the system cannot have this effect; empty if it can."""
         declared = system if isinstance(system, type) else type(system)
         heavy = any(c.name == "gravity" for c in system.constants)
         says_push = declared.push is not System.push
@@ -503,7 +539,7 @@ class Effect(ABC):
             "": "",
             "input": "" if system.inputs else "it has no input",
             "ground": "" if system.bounces else "it meets no ground",
-            # What bounces flies freely: dry friction and springs have nothing to hold on to.
+            # A bouncing body flies freely: dry friction and springs would act against nothing.
             "guide": "it flies freely" if system.bounces else "",
             "joint": "" if _is_joint(system) else "it is not one joint alone",
             "servo": "" if declared.servo else "it has no servo that follows a set point",
@@ -520,38 +556,42 @@ class Effect(ABC):
 
     @classmethod
     def on(cls, system: System | type[System]) -> tuple[Coefficient, ...]:
-        """The coefficients that the effect has on this system."""
-        # Those that the kind does not have come last, so the others are the first ones.
+        """Return the coefficients that the effect has on this system."""
+        # Coefficients that the kind does not have come last.
         return tuple(takewhile(lambda c: c.unit(system.kind) is not None, cls.coefficients))
 
 
 def _is_joint(system: System | type[System]) -> bool:
-    """Whether it is a single joint, declared in equations."""
+    """Return whether a system is a single joint, declared by equations."""
     return len(system.coordinates) == 1 and not system.bounces and not system.has_model
 
 
 def members_of(effect: Effect | type[Effect]) -> Sequence[Any]:
-    """Return the members of a family, which are instances; any other effect alone."""
+    """Return the members of a family, which are instances; otherwise the effect alone."""
     members: Sequence[Any] = getattr(effect, "members", ()) or (effect,)
     return members
 
 
 class Force(Effect):
-    """A generalised force, added to the others."""
+    """Generalised force, added to the others."""
 
     hook = "force"
     at: ClassVar[PlaceKind] = "joint"
 
     @abstractmethod
     def force(self, c: Array, moment: Moment) -> Array:
-        """(L, D) generalised force."""
+        """Return the generalised force (L, D).
+
+        Args:
+            c: Coefficients (K, L, 1).
+            moment: State of all batch elements.
+        """
 
 
 class Friction(Effect):
-    """Dry friction: opposes motion with at most `limit`, and holds still at rest what pulls less
-    than that.
+    """Dry friction, which opposes motion with at most `limit` and prevents motion at lower loads.
 
-    Engines add up the limits of all frictions and apply one force against the motion.
+    Engines add the limits of all frictions and apply one force against the motion.
     """
 
     hook = "force"
@@ -559,16 +599,21 @@ class Friction(Effect):
 
     @abstractmethod
     def limit(self, c: Array, moment: Moment) -> Array:
-        """(L, 1) largest force, >= 0."""
+        """Return the maximum force (L, 1), >= 0.
+
+        Args:
+            c: Coefficients (K, L, 1).
+            moment: State of all batch elements.
+        """
 
 
 @dataclass(frozen=True)
 class State:
-    """The state of its own that an effect has.
+    """Hidden state of an effect.
 
     Attributes:
-        x: (L, 1) position, or whatever else its first number is.
-        v: (L, 1) rate of it.
+        x: (L, 1) position, or another first quantity.
+        v: (L, 1) rate of `x`.
     """
 
     x: Array
@@ -577,13 +622,13 @@ class State:
 
 @dataclass(frozen=True)
 class Element:
-    """What lies in series between a drive and what it carries, in many lanes.
+    """Element in series between a drive and its load, for many batch elements.
 
     Attributes:
-        stiffness: (L,) N/m or N m/rad of its spring; none where it is not above zero.
-        damping: (L,) share of the critical one of what is carried on that spring.
-        gap: (L,) m or rad between its flanks; with a spring, flanks that give.
-        drive: (L,) inertia of the drive besides what is stated, as a share of the joint's.
+        stiffness: (L,) stiffness of its spring, N/m or N m/rad; no spring if not above zero.
+        damping: (L,) damping ratio of the load on that spring.
+        gap: (L,) backlash between its flanks, m or rad; with a spring, the flanks are elastic.
+        drive: (L,) inertia of the drive in addition to the stated one, as a share of the joint's.
     """
 
     stiffness: Array
@@ -593,8 +638,7 @@ class Element:
 
 
 class Hidden(Effect):
-    """A force that hangs on more than the system's own motion: on a state that no sensor shows,
-    and that goes on beside it as one more coordinate.
+    """Force with a hidden state, which no sensor shows and which is integrated as a coordinate.
 
     It is off where its first coefficient is not above zero.
     """
@@ -603,40 +647,55 @@ class Hidden(Effect):
     at: ClassVar[PlaceKind] = "joint"
     needs = "joint"
     fastest: ClassVar[float] = 0.0
-    """rad/s with which it may swing, where that is not to be seen at rest."""
+    """Maximum angular frequency of its oscillations in rad/s, if it is not visible at rest."""
     between: ClassVar[tuple[Coefficient, ...]] = ()
-    """Its numbers where both sides of it are known, as in a robot, if it is an element in series
-    between a drive and what that carries."""
+    """Its coefficients where both sides are known, as in a robot.
+
+    Only for an element in series between a drive and its load.
+    """
 
     def element(self, c: Array) -> Element:
-        """The element of these numbers (K, L), of those that `between` has."""
+        """Return the series element with these values (K, L) of the coefficients `between`."""
         raise NotImplementedError
 
     def behind(self, c: Array) -> Array:
-        """(L, 1) share of the joint's inertia that moves with the hidden coordinate, below 1."""
+        """Return the share (L, 1) of the joint's inertia on the hidden coordinate, below 1."""
         return np.zeros_like(c[0])
 
     def begin(self, c: Array, moment: Moment) -> State:  # noqa: ARG002
-        """Its state when the run begins, at that moment."""
+        """Return the hidden state at the beginning of the run.
+
+        Args:
+            c: Coefficients (K, L, 1).
+            moment: State of all batch elements at the beginning.
+        """
         return State(np.zeros_like(c[0]), np.zeros_like(c[0]))
 
     @abstractmethod
     def act(self, c: Array, moment: Moment, state: State) -> tuple[Array, Array]:
-        """The generalised force (L, D) that it adds, and the rate (L, 1) of `state.v`."""
+        """Return the generalised force and the rate of the hidden state.
+
+        Args:
+            c: Coefficients (K, L, 1).
+            moment: State of all batch elements.
+            state: Hidden state.
+
+        Returns:
+            Force (L, D) that the effect adds, and rate (L, 1) of `state.v`.
+        """
 
 
 class Value(Effect):
-    """A number that a robot's model file states, and that may be wrong; the engine writes it into
-    the model.
-    """
+    """Number in a robot's model file that may be wrong; the engine writes it into the model."""
 
     hook = "value"
     needs = "model"
 
 
 class Level(Effect):
-    """A bound of what a system stores, such as the level of a tank; an own simulator takes it after
-    each of its steps.
+    """Bound of a stored quantity, such as a tank's level.
+
+    A user-defined simulator applies it after each of its steps.
     """
 
     hook = "level"
@@ -645,37 +704,50 @@ class Level(Effect):
 
     @abstractmethod
     def keep(self, c: Array, level: Array) -> Array:
-        """(L, 1) what remains of a level (L, 1)."""
+        """Return the bounded level (L, 1).
+
+        Args:
+            c: Coefficients (K, L, 1).
+            level: (L, 1) level before.
+        """
 
 
 class Contact(Effect):
-    """A change to what happens at an impact with the ground."""
+    """Change of an impact with the ground."""
 
     hook = "contact"
     at: ClassVar[PlaceKind] = "world"
 
     def restitution(self, c: Array, restitution: Array, speed: Array) -> Array:  # noqa: ARG002
-        """(L, 1) restitution from what it would be, and the impact speed (L, 1) >= 0 in m/s."""
+        """Return the restitution (L, 1).
+
+        Args:
+            c: Coefficients (K, L, 1).
+            restitution: (L, 1) restitution without the effect.
+            speed: (L, 1) impact speed, >= 0, m/s.
+        """
         return restitution
 
     def friction(self, c: Array) -> Array:
-        """(L, 1) friction coefficient: tangential speed lost is this times (1 + e) |vn|, never more
-        than there is.
+        """Return the friction coefficient (L, 1).
+
+        The tangential speed lost is this times (1 + e) |vn|, limited by the tangential speed
+        itself.
         """
         return np.zeros_like(c[0])
 
 
 @dataclass(frozen=True)
 class Signal:
-    """A signal on the steps of an integration.
+    """Signal on the steps of an integration.
 
     Attributes:
-        values: (L, S); for an input the constant value over each step, for a reading the value at
+        values: (L, S) for an input, the constant value over each step; for a reading, the value at
             its end.
-        steps: (L, S) lengths of the steps, seconds; zero where a lane waits.
+        steps: (L, S) lengths of the steps, s; zero where a batch element waits.
         start: (L, 1) value before the first step.
-        times: (L, S) seconds since the start of the run, at the end of each step.
-        clock: (L, 1) what the recording's stamps say at the start of the run, seconds.
+        times: (L, S) time since the start of the run at the end of each step, s.
+        clock: (L, 1) time stamp of the recording at the start of the run, s.
     """
 
     values: Array
@@ -686,42 +758,63 @@ class Signal:
 
 
 class Input(Effect):
-    """The first input as the plant feels it. Several are applied in the order of `bench` and the
-    command line.
+    """Change of the first input on its way to the plant.
+
+    Several effects are applied in the order given by the user.
     """
 
     hook = "input"
     at: ClassVar[PlaceKind] = "actuator"
     needs = "input"
     between: ClassVar[bool] = False
-    """Whether its first coefficient is the share with which the signal goes from sample to sample
-    as the recording does not say: straight where it is said to hold."""
+    """Whether its first coefficient is the share of the opposite interpolation between samples.
+
+    That is linear interpolation for an input that is stated to be held, and the reverse.
+    """
 
     def times(self, c: Array, t: Array) -> Array:  # noqa: ARG002
-        """The instants (L, S) of the commanded signal that are felt at instants t (L, S)."""
+        """Return the times (L, S) of the commands that are applied at times t (L, S).
+
+        Args:
+            c: Coefficients (K, L, 1).
+            t: (L, S) times since the start of the run, s.
+        """
         return t
 
     def feel(self, c: Array, signal: Signal) -> Array:  # noqa: ARG002
-        """(L, S) felt values over the steps."""
+        """Return the applied values (L, S) over the steps.
+
+        Args:
+            c: Coefficients (K, L, 1).
+            signal: Signal before the effect.
+        """
         return signal.values
 
 
 class Sensor(Effect):
-    """The observation as recorded."""
+    """Change of an observation by the sensor that records it."""
 
     hook = "sensor"
     at: ClassVar[PlaceKind] = "channel"
     filters: ClassVar[bool] = False
-    """Whether `read` must see every step of the integration rather than the samples alone."""
+    """Whether `read` needs every step of the integration instead of the samples only."""
 
     def times(self, c: Array, t: Array) -> Array:  # noqa: ARG002
-        """The instants (L, T) at which the world is really sampled, for recorded time stamps t
-        since the start.
+        """Return the times (L, T) at which the system is really sampled.
+
+        Args:
+            c: Coefficients (K, L, 1).
+            t: (L, T) recorded times since the start of the run, s.
         """
         return t
 
     def read(self, c: Array, signal: Signal) -> Array:  # noqa: ARG002
-        """(L, S) recorded values."""
+        """Return the recorded values (L, S).
+
+        Args:
+            c: Coefficients (K, L, 1).
+            signal: Signal before the effect.
+        """
         return signal.values
 
 
@@ -731,19 +824,19 @@ Acting = tuple[tuple[Effect, Array], ...]
 
 @dataclass(frozen=True)
 class Lanes:
-    """Work for an engine.
+    """Batch of simulations to be integrated by an engine.
 
     Attributes:
-        system: what to integrate.
-        theta: (L, p) the system's parameters.
-        constants: (L, 1) by name.
+        system: System to integrate.
+        theta: (L, p) parameters of the system.
+        constants: Constants (L, 1) by name.
         x: (L, D) initial position.
         v: (L, D) initial velocity.
-        steps: (L, S) step lengths in seconds; zero where a lane has nothing more to do.
-        inputs: felt inputs (L, S) by name, constant over each step.
-        effects: forces, frictions and contacts; inputs and sensors are dealt with outside the
-            engine.
-        every: keep the state after every this many steps (and the initial one).
+        steps: (L, S) lengths of the steps, s; zero where a batch element has finished.
+        inputs: Applied inputs (L, S) by name, constant over each step.
+        effects: Forces, frictions, contacts and effects with other hooks of the engine; inputs and
+            sensors are processed outside the engine.
+        every: Number of steps after which the state is stored, in addition to the initial state.
     """
 
     system: System
@@ -759,10 +852,10 @@ class Lanes:
 
 @dataclass(frozen=True)
 class Motion:
-    """What an engine gives back: positions, velocities, accelerations (L, S // every + 1, D).
+    """Result of an engine: positions, velocities, accelerations (L, S // every + 1, D).
 
-    The acceleration is that of the smooth motion (an impact's shock is not in it). A lane that
-    failed is NaN.
+    The acceleration is that of the smooth motion without the shocks of impacts. Failed batch
+    elements are NaN.
     """
 
     x: Array
@@ -771,21 +864,21 @@ class Motion:
 
 
 class Engine(Protocol):
-    """Integrates lanes."""
+    """Integrator of batches of simulations."""
 
     name: str
     requires: tuple[str, ...]
     largest_step: float
-    """Seconds; the plan divides sampling intervals into steps not longer than this."""
+    """Maximum step in seconds, to which sampling intervals are divided."""
 
     def integrate(self, lanes: Lanes) -> Motion:
-        """Integrate every lane over its steps."""
+        """Integrate every batch element over its steps."""
         ...
 
     def refuses(self, system: type[System]) -> str:
-        """Why this engine cannot carry the system; empty if it can."""
+        """Return why this engine cannot integrate the system; empty if it can."""
         ...
 
     def close(self) -> None:
-        """Give back worlds."""
+        """Release the engine's worlds."""
         ...

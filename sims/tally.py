@@ -1,7 +1,7 @@
-"""How many simulations this process has made, and how many it may make.
+"""Counter and limit of the simulations in this process.
 
-Every simulator of a declared system counts its lanes here, whoever asks for them. A comparison of
-diagnosers sets the limit; without one nothing is refused.
+Every simulator of a declared system counts its simulations here. A comparison of diagnosers sets
+the limit; by default there is none.
 """
 
 from __future__ import annotations
@@ -10,35 +10,38 @@ from dataclasses import dataclass
 
 
 class SpentError(RuntimeError):
-    """More simulations were asked for than are allowed."""
+    """More simulations were requested than are allowed."""
 
 
 @dataclass
 class Tally:
-    """Simulations of this process.
+    """Counter of simulations.
 
     Attributes:
-        used: lanes simulated so far.
-        most: that may be; None for no limit.
+        used: Number of simulations so far.
+        most: Maximum number of simulations; None for no limit.
     """
 
     used: int = 0
     most: int | None = None
 
     def count(self, lanes: int) -> None:
-        """Count lanes that are about to be simulated.
+        """Count simulations before they are made.
+
+        Args:
+            lanes: Number of batch elements, each of which is one simulation.
 
         Raises:
-            SpentError: they are more than what is left; none of them is counted.
+            SpentError: They exceed the limit; none of them is counted.
         """
         if self.most is not None and self.used + lanes > self.most:
             raise SpentError(f"{self.used + lanes} simulations asked for, {self.most} are allowed")
         self.used += lanes
 
     def begin(self, most: int | None = None) -> None:
-        """Count anew from zero."""
+        """Reset the counter to zero, and set the limit."""
         self.used, self.most = 0, most
 
 
 TALLY = Tally()
-"""Of this process."""
+"""Counter of this process."""

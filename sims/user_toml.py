@@ -1,8 +1,8 @@
-"""Checks of a user's TOML file: each fault is one line that names file, entry, expected and found.
+"""Check values of a user's TOML file, with one-line errors.
 
-Every check takes the source that its message begins with (the file's path, or what a person calls
-the thing), where in it the value stands (``noise.x``), and the value; it returns the value as the
-program uses it.
+An error names file, entry, expected and found value. Each check takes the source with which its
+message begins (the path of the file, or a name), the entry in it (``noise.x``), and the value, and
+returns the value as the program uses it.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from sims.files import require_file
 from sims.limits import LARGEST, LINE, MOST, cut
 
 if sys.version_info >= (3, 11):
-    import tomllib as tomllib  # others have it from here
+    import tomllib as tomllib  # re-exported for other modules
 else:
     import tomli as tomllib
 
 Source = Path | str
 Pair = tuple[float, float]
-"""The lower and the upper end of a range."""
+"""Lower and upper end of a range."""
 
 _LONGEST = 40
-"""Characters of a user's value that a message quotes."""
+"""Maximum number of characters of a user's value that a message quotes."""
 
 _WORDS: Mapping[type, str] = {
     str: "text",
@@ -41,30 +41,31 @@ _WORDS: Mapping[type, str] = {
     list: "a list",
     bool: "a bool",
 }
-"""What a message calls a value of each type."""
+"""Description of each type in messages."""
 
 _WIDER: Mapping[type, tuple[type, ...]] = {float: (int, float), list: (list, tuple)}
-"""Types that pass for another: a TOML number may have no point, a list from Python may be fixed."""
+"""Types accepted instead of another: TOML integers as floats, tuples from Python as lists."""
 
 
 def toml_text(text: str) -> str:
-    """Return a text as a string of TOML."""
+    """Format a text as a TOML string."""
     return json.dumps(text, ensure_ascii=False)
 
 
 def toml_key(name: str) -> str:
-    """Return a name as a key of TOML: in quotation marks if it has other characters than letters
-    and digits of ASCII, ``_`` and ``-``.
+    """Format a name as a TOML key.
+
+    It is quoted if it contains characters other than ASCII letters, digits, ``_`` and ``-``.
     """
     bare = name.replace("_", "").replace("-", "")
     return name if bare.isascii() and bare.isalnum() else toml_text(name)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file.
+    """Read a TOML file.
 
     Raises:
-        InputError: the file is missing, unreadable or not TOML.
+        InputError: The file is missing, unreadable or not TOML.
     """
     require_file(path)
     try:
@@ -77,30 +78,40 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     try:
         return tomllib.loads(text)
-    except ValueError as error:  # bad TOML, or a date or number that cannot be
+    except ValueError as error:  # bad TOML, or an impossible date or number
         raise InputError(f"{path}: not valid TOML: {error}") from None
-    except RecursionError:  # a file may be nothing but brackets
+    except RecursionError:  # for example a file of brackets only
         raise InputError(f"{path}: not valid TOML: nested too deeply") from None
 
 
 def shown(value: object) -> str:
-    """A value from a user's file as a message quotes it: short."""
+    """Format a value of a user's file for a message, truncated."""
     return cut(repr(value), _LONGEST)
 
 
 def fault(source: Source, where: str, wanted: str, value: object) -> InputError:
-    """The error for a value that is not what is wanted; `where` may be empty."""
-    place = f"{cut(where, LINE)}: " if where else ""  # a whole file has no place in itself
+    """Make the error for a value that is not as expected.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value; empty for the whole file.
+        wanted: Description of the expected value.
+        value: Value that was found.
+    """
+    place = f"{cut(where, LINE)}: " if where else ""  # no entry if the whole file is meant
     return InputError(f"{source}: {place}expected {wanted}, found {shown(value)}")
 
 
 def known(kind: str, given: Iterable[str], allowed: Iterable[str]) -> None:
-    """Refuse names that are not among the allowed ones.
+    """Check that all names are among the allowed ones.
 
     Args:
-        kind: what a message calls one of them, and where, e.g. ``entry of [noise] in mine.toml``.
-        given: what the user wrote.
-        allowed: what there is.
+        kind: Kind of the names and their place in messages, e.g. ``entry of [noise] in mine.toml``.
+        given: Names that the user wrote.
+        allowed: Allowed names.
+
+    Raises:
+        InputError: A name is not allowed.
     """
     names = list(allowed)
     for name in given:
@@ -109,29 +120,51 @@ def known(kind: str, given: Iterable[str], allowed: Iterable[str]) -> None:
 
 
 def checked(source: Source, where: str, value: Any, wanted: type, words: str = "") -> Any:
-    """`value`, if it is of this type; any number will do where a float is wanted.
+    """Check the type of a value; integers are accepted as floats.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        wanted: Expected type.
+        words: Description of the expected value; that of the type if empty.
 
     Raises:
-        InputError: it is not; `words` stand for what was expected, in place of the usual ones.
+        InputError: The value has another type.
     """
     kinds = _WIDER.get(wanted, (wanted,))
-    # Python counts true and false among the whole numbers.
+    # In Python, booleans are integers.
     mistaken = isinstance(value, bool) and wanted is not bool
     if mistaken or not isinstance(value, kinds):
         raise fault(source, where, words or _WORDS[wanted], value)
     size: Any = value
-    if wanted is int and not -MOST <= size <= MOST:  # TOML's whole numbers have no end
+    if wanted is int and not -MOST <= size <= MOST:  # TOML integers are unbounded
         raise fault(source, where, f"{words or _WORDS[int]} within ±{MOST:.0e}", value)
     return value
 
 
 def table(source: Source, where: str, value: Any, words: str = "") -> dict[str, Any]:
-    """`value` as a table."""
+    """Check that `value` is a table.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        words: Description of the expected value; the default one if empty.
+    """
     return dict(checked(source, where, value, dict, words))
 
 
 def text(source: Source, where: str, value: Any, words: str = "", most: int = LINE) -> str:
-    """`value` as text of at most so many characters."""
+    """Check that `value` is a text of at most `most` characters.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        words: Description of the expected value; the default one if empty.
+        most: Maximum number of characters.
+    """
     read = str(checked(source, where, value, str, words))
     if len(read) > most:
         raise fault(source, where, f"at most {most} characters, not {len(read)}", value)
@@ -141,22 +174,43 @@ def text(source: Source, where: str, value: Any, words: str = "", most: int = LI
 def names(
     source: Source, where: str, value: Any, words: str = "a list of names"
 ) -> tuple[str, ...]:
-    """`value` as a list of texts."""
+    """Check that `value` is a list of texts.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        words: Description of the expected value.
+    """
     if not isinstance(value, list | tuple) or not all(isinstance(name, str) for name in value):
         raise fault(source, where, words, value)
     return tuple(value)
 
 
 def number(source: Source, where: str, value: Any, words: str = "") -> float:
-    """`value` as a number, which may be infinite or none (TOML writes inf and nan)."""
+    """Check that `value` is a number, which may be infinite or NaN (TOML has inf and nan).
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        words: Description of the expected value; the default one if empty.
+    """
     try:
         return float(checked(source, where, value, float, words))
-    except OverflowError:  # TOML's whole numbers have no end
+    except OverflowError:  # TOML integers are unbounded
         raise fault(source, where, words or _WORDS[float], value) from None
 
 
 def finite(source: Source, where: str, value: Any, words: str = "") -> float:
-    """`value` as a number that is finite, and of a size that can be meant."""
+    """Check that `value` is a finite number of plausible size.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        words: Description of the expected value; the default one if empty.
+    """
     result = number(source, where, value, words)
     if not math.isfinite(result):
         raise fault(source, where, words or _WORDS[float], value)
@@ -168,20 +222,40 @@ def finite(source: Source, where: str, value: Any, words: str = "") -> float:
 def numbers(
     source: Source, where: str, value: Any, count: int, words: str = ""
 ) -> tuple[float, ...]:
-    """`value` as a list of so many numbers."""
+    """Check that `value` is a list of `count` finite numbers.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        count: Required number of entries.
+        words: Description of the expected value; the default one if empty.
+    """
     if not isinstance(value, list | tuple) or len(value) != count:
         raise fault(source, where, words or f"{count} numbers", value)
     return tuple(finite(source, where, entry) for entry in value)
 
 
 def ends(source: Source, where: str, value: Any) -> Pair:
-    """`value` as two numbers, in whatever order."""
+    """Check that `value` is a list of two numbers in any order.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+    """
     low, high = numbers(source, where, value, 2, "[low, high]")
     return low, high
 
 
 def pair(source: Source, where: str, value: Any) -> Pair:
-    """`value` as two numbers that increase."""
+    """Check that `value` is a list of two increasing numbers.
+
+    Args:
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+    """
     low, high = ends(source, where, value)
     if not low < high:
         raise fault(source, where, "low < high", value)
@@ -189,24 +263,25 @@ def pair(source: Source, where: str, value: Any) -> Pair:
 
 
 def as_declared(source: Source, where: str, value: Any, declared: Any) -> Any:
-    """`value` as a type annotation asks for it, whatever is in it checked likewise.
+    """Check a value, including its content, against a type annotation, and convert it.
 
     Args:
-        source: what messages begin with.
-        where: in it the value stands.
-        value: from the file.
-        declared: text, numbers, bools, pairs of numbers, tuples of one type, mappings from names, a
-            dataclass or TypedDict of all these; `None` in a union is what a file leaves out.
+        source: File or name with which the message begins.
+        where: Entry of the value.
+        value: Value from the file.
+        declared: Annotation: text, number, bool, pair of numbers, tuple of one type, mapping from
+            names, or a dataclass or TypedDict of these; `None` in a union means that the entry may
+            be missing.
 
     Raises:
-        InputError: it is not.
+        InputError: The value does not match.
     """
     origin, inner = get_origin(declared), get_args(declared)
     if declared is Any:
-        return value  # whoever uses it checks it, as a simulator its settings
+        return value  # checked where it is used, for example settings by a simulator
     if origin in (Union, UnionType):
         return as_declared(source, where, value, _chosen(value, inner))
-    if declared == Pair:  # before other tuples: those may be of any length
+    if declared == Pair:  # before other tuples, which may have any length
         return pair(source, where, value)
     if origin is tuple:
         items = checked(source, where, value, list)
@@ -223,7 +298,7 @@ def as_declared(source: Source, where: str, value: Any, declared: Any) -> Any:
 
 
 def _mapping(source: Source, where: str, value: Any, declared: Any) -> dict[str, Any]:
-    """A table whose entries have any names and are all of one type."""
+    """Check a table with arbitrary names whose entries are all of one type."""
     result = {}
     for key, item in table(source, where, value).items():
         result[key] = as_declared(source, f"{where}.{key}", item, declared)
@@ -233,36 +308,39 @@ def _mapping(source: Source, where: str, value: Any, declared: Any) -> dict[str,
 def entries(
     source: Source, where: str, value: Any, hints: Mapping[str, Any], kind: str = ""
 ) -> dict[str, Any]:
-    """`value` as a table whose entries are the names of `hints`, each as its hint asks for it.
+    """Check a table whose entries have the names and types of `hints`.
 
     Args:
-        source: what messages begin with.
-        where: in it the table stands; empty for the whole of it.
-        value: from the file.
-        hints: type annotations by name.
-        kind: what a message calls an entry of the table, and where.
+        source: File or name with which the message begins.
+        where: Entry of the table; empty for the whole file.
+        value: Value from the file.
+        hints: Type annotations by name.
+        kind: Kind of the entries and their place in messages; derived from `where` if empty.
+
+    Raises:
+        InputError: A name is unknown, or an entry has a wrong type.
     """
     given = table(source, where, value)
-    # Names first: the type of a key that does not exist would be a riddle.
+    # Check names first: an error about the type of an unknown key would be confusing.
     known(kind or f"entry of [{where}] in {source}", given, hints)
     result = {}
     for key, item in given.items():
         place = f"{where}.{key}" if where else key
         read = as_declared(source, place, item, hints[key])
-        # A whole number stays one: names of runs and of trained weights hash what is written.
+        # Keep integers, because hashes of runs and trained weights depend on what is written.
         result[key] = item if hints[key] is float else read
     return result
 
 
 @cache
 def hints_of(kind: type) -> dict[str, Any]:
-    """The fields of a dataclass or TypedDict with their types."""
+    """Return the fields of a dataclass or TypedDict with their types."""
     return get_type_hints(kind)
 
 
 def _chosen(value: Any, among: Sequence[Any]) -> Any:
-    """Which type of a union the value is checked against: a list against a pair, else the first."""
-    # TOML has no null: what may be None is left out.
+    """Return the type of a union to check a value against: a tuple for a list, else the first."""
+    # TOML has no null: entries that may be None are left out.
     kinds = [kind for kind in among if kind is not NoneType]
     lists = [kind for kind in kinds if get_origin(kind) is tuple]
     return lists[0] if lists and isinstance(value, list | tuple) else kinds[0]

@@ -1,8 +1,8 @@
 """Make this example's recording again: `python examples/robot/make_log.py FOLDER`.
 
-The "real" arm is written out here, as the equations of motion of two links in a plane, integrated
-by scipy from event to event. MuJoCo has no part in it. Its elbow has dry friction, which sticks;
-that is what the model `arm2.xml` lacks.
+The "real" arm is given here by the equations of motion of two links in a plane, which SciPy
+integrates from event to event. MuJoCo is not used. The elbow has dry friction, which can stick; the
+model `arm2.xml` lacks it.
 """
 
 from __future__ import annotations
@@ -18,32 +18,34 @@ from scipy.integrate import solve_ivp
 Array = npt.NDArray[np.float64]
 
 RATE = 100
-"""Samples and commands a second; a command holds until the next."""
+"""Sampling rate of samples and commands in Hz; a command is held until the next."""
 SECONDS = 4
+"""Length of a run, s."""
 NOISE = 0.001
-"""Of the encoders: 1 sigma of one sample, rad."""
+"""Standard deviation of the encoder noise, rad."""
 RUNS = range(1, 7)
+"""Numbers of the runs."""
 TORQUES = (1.0, 0.3)
-"""Of the commands at shoulder and elbow: root mean square, N m."""
+"""Root mean square of the commands at shoulder and elbow, N m."""
 FRICTION = 0.03
-"""What is hidden: dry friction at the elbow, N m."""
+"""Hidden cause: dry friction at the elbow, N m."""
 HAIR = 1e-9
-"""By which an event is late, N m or rad/s, lest rounding repeat it."""
+"""Offset that delays an event, N m or rad/s, so that rounding does not repeat it."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """Two links that hang in a vertical plane, with the numbers of arm2.xml, in SI units.
+    """Arm of two links in a vertical plane with the numbers of arm2.xml, in SI units.
 
     Attributes:
-        mass: of the upper arm and the forearm.
-        centre: distance of their centres of mass from their joints.
-        inertia: about their centres of mass.
-        armature: inertia of the motors, as the joints feel it.
-        damping: viscous, at the joints.
-        length: of the upper arm, from shoulder to elbow.
-        gravity: downwards.
-        friction: dry friction at the elbow.
+        mass: Masses of the upper arm and the forearm.
+        centre: Distances of their centres of mass from their joints.
+        inertia: Moments of inertia about their centres of mass.
+        armature: Inertias of the motors, reflected to the joints.
+        damping: Viscous damping at the joints.
+        length: Length of the upper arm, from shoulder to elbow.
+        gravity: Gravitational acceleration, downwards.
+        friction: Dry friction at the elbow.
     """
 
     mass: tuple[float, float] = (1.2, 0.8)
@@ -56,7 +58,7 @@ class Arm:
     friction: float = 0.0
 
     def inertias(self, q: Array) -> Array:
-        r"""The mass matrix, (2, 2).
+        r"""Return the mass matrix (2, 2).
 
         .. math:: M_{11} = I_1 + m_1 c_1^2 + m_2 l^2 + 2 x + M_{22} - a_2 + a_1,\;
             M_{12} = I_2 + m_2 c_2^2 + x,\; M_{22} = I_2 + m_2 c_2^2 + a_2,\;
@@ -69,7 +71,7 @@ class Arm:
         return np.array([[whole + a1, forearm + across], [forearm + across, forearm + a2]])
 
     def forces(self, q: Array, v: Array, torque: Array) -> Array:
-        r"""All that accelerates, but for dry friction, (2,).
+        r"""Return the generalised forces (2,), including Coriolis terms but without dry friction.
 
         .. math:: f_1 = u_1 - d_1 v_1 + h (2 v_1 v_2 + v_2^2) - g (m_1 c_1 + m_2 l) \sin q_1 - w,\;
             f_2 = u_2 - d_2 v_2 - h v_1^2 - w,\; h = m_2 l c_2 \sin q_2,\;
@@ -85,7 +87,13 @@ class Arm:
         return forces
 
     def rate(self, state: Array, torque: Array, slide: int) -> Array:
-        """Velocities and accelerations, (4,), where the elbow slides (1, -1) or sticks (0)."""
+        """Return velocities and accelerations (4,), with the elbow sliding (1, -1) or sticking (0).
+
+        Args:
+            state: (4,) positions and velocities.
+            torque: (2,) torques.
+            slide: Direction in which the elbow slides, or 0.
+        """
         q, v = state[:2], state[2:]
         inertias, forces = self.inertias(q), self.forces(q, v, torque)
         if slide == 0:
@@ -93,30 +101,40 @@ class Arm:
         return np.append(v, np.linalg.solve(inertias, forces - [0.0, slide * self.friction]))
 
     def pushed(self, state: Array, torque: Array) -> float:
-        """The torque that a sticking elbow has to hold, N m."""
+        """Return the torque on a sticking elbow, N m."""
         inertias = self.inertias(state[:2])
         forces = self.forces(state[:2], state[2:], torque)
         return float(forces[1] - inertias[1, 0] * forces[0] / inertias[0, 0])
 
     def grip(self, state: Array, torque: Array) -> float:
-        """What a sticking elbow could hold beyond what it has to, N m; below 0 it breaks loose."""
+        """Return the margin of a sticking elbow before break-away, N m; it slides below 0."""
         return self.friction - abs(self.pushed(state, torque))
 
     def released(self, state: Array, torque: Array) -> int:
-        """How an elbow that stands goes on: 0 where it sticks, else the way it is pushed."""
+        """Return how an elbow at rest continues: 0 if it sticks, else the sliding direction."""
         if self.grip(state, torque) > HAIR:
             return 0
         return 1 if self.pushed(state, torque) > 0 else -1
 
     def advance(self, state: Array, slide: int, torque: Array, seconds: float) -> tuple[Array, int]:
-        """The state after a time of constant torque, and how its elbow slides there."""
+        """Integrate over a time of constant torque.
+
+        Args:
+            state: (4,) positions and velocities.
+            slide: Direction in which the elbow slides, or 0.
+            torque: (2,) torques.
+            seconds: Length of the time, s.
+
+        Returns:
+            The state at the end, and the sliding direction there.
+        """
         now = 0.0
         while now < seconds:
             if slide == 0:
                 slide = self.released(state, torque)
 
             def change(_: float, y: Array, slide: int = slide) -> float:
-                """Falls through zero where the elbow stops or breaks loose, a hair late."""
+                """Return a value that crosses zero just after the elbow stops or breaks away."""
                 return slide * float(y[3]) + HAIR if slide else self.grip(y, torque)
 
             change.terminal, change.direction = True, -1  # type: ignore[attr-defined]
@@ -135,8 +153,14 @@ class Arm:
         return state, slide
 
     def simulate(self, initial: Array, torques: Array) -> Array:
-        """Positions at the samples, (T, 2), rad, from a state (4,) at rest or not, with the torques
-        (T, 2), N m, each from its sample to the next.
+        """Simulate the arm.
+
+        Args:
+            initial: (4,) initial positions and velocities.
+            torques: (T, 2) torques, each held from its sample to the next.
+
+        Returns:
+            Positions (T, 2) at the samples, rad.
         """
         state = np.array(initial, dtype=float)
         slide = int(np.sign(state[3])) if self.friction else 1
@@ -148,7 +172,7 @@ class Arm:
 
 
 def torques_of(number: int) -> Array:
-    """The commands of a run, (T, 2), N m: four sines at each joint."""
+    """Return the commands (T, 2) of a run, N m: a sum of four sines at each joint."""
     rng = np.random.default_rng([16, number])
     time = np.arange(SECONDS * RATE) / RATE
     waves = 2 * np.pi * (rng.uniform(0.2, 1.6, (2, 4, 1)) * time + rng.uniform(size=(2, 4, 1)))
@@ -158,7 +182,7 @@ def torques_of(number: int) -> Array:
 
 
 def rows_of(number: int, arm: Arm) -> list[str]:
-    """The table's lines of a run, which begins with the arm hanging at rest."""
+    """Return the table's lines of a run, which begins with the arm hanging at rest."""
     torques = torques_of(number)
     positions = arm.simulate(np.zeros(4), torques)
     measured = positions + NOISE * np.random.default_rng([61, number]).normal(size=positions.shape)
@@ -169,7 +193,7 @@ def rows_of(number: int, arm: Arm) -> list[str]:
 
 
 def table(friction: float = FRICTION) -> str:
-    """The recording's table, as log.csv holds it."""
+    """Return the recording's table, as in log.csv."""
     lines = ["run,t,u.m_shoulder,u.m_elbow,q.shoulder,q.elbow"]
     for number in RUNS:
         lines += rows_of(number, Arm(friction=friction))

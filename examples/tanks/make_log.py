@@ -1,10 +1,11 @@
-"""Makes overflow.csv and overflow.toml, recordings of two tanks whose upper one is too low; with
---clean its rim is out of reach: ``python examples/tanks/make_log.py``.
+"""Make overflow.csv and overflow.toml: ``python examples/tanks/make_log.py``.
 
-Written without the project: SciPy's LSODA solves the tanks from one change of the voltage to the
-next, and is stopped where the upper level meets the rim and where it leaves it. At the rim
+The recording shows two tanks, of which the upper one overflows at a low rim; with --clean,
+clean.csv is written, in which the rim is out of reach. SciPy's LSODA integrates the tanks from one
+change of the voltage to the next, without the project's own code, and stops where the upper level
+reaches the rim. At the rim
 
-    h1' = 0    while what comes in is more than what flows out                                   (1)
+    h1' = 0    while the inflow exceeds the outflow                                              (1)
 """
 
 import csv
@@ -17,7 +18,7 @@ from scipy.integrate import solve_ivp
 AREA, G = 2.8e-3, 9.81
 PUMP, UPPER, LOWER = 3.4e-6, 7.4e-6, 7.8e-6
 RIM, NOISE = 0.2, 1e-3
-STEP, SAMPLES, HOLD = 4.0, 120, 15  # seconds from sample to sample; samples to a voltage
+STEP, SAMPLES, HOLD = 4.0, 120, 15  # sampling interval in s; samples; samples per voltage
 STARTS = ((0.05, 0.04), (0.1, 0.12), (0.03, 0.06))
 RUNS = (
     (5.0, 2.0, 3.5, 5.5, 3.0, 4.5, 1.5, 4.0),
@@ -27,12 +28,12 @@ RUNS = (
 
 
 def flow(outlet, level):
-    """What an outlet lets through, m^3/s: Torricelli's law."""
+    """Return the flow through an outlet, m^3/s, by Torricelli's law."""
     return outlet * np.sqrt(2 * G * max(level, 0.0))
 
 
 def solved(volts, start, rim):
-    """Levels (SAMPLES, 2) of one run."""
+    """Return the levels (SAMPLES, 2) of one run, m."""
     rows, state = [np.array(start)], np.array(start)
     for u in volts:
         times = STEP * np.arange(1, HOLD + 1)
@@ -43,7 +44,7 @@ def solved(volts, start, rim):
 
 
 def _held(inflow, state, times, rim):
-    """Levels at `times` under a constant inflow."""
+    """Return the levels at `times` under a constant inflow."""
     over = inflow > flow(UPPER, rim)
 
     def rates(_, h):
@@ -70,7 +71,7 @@ def _held(inflow, state, times, rim):
 
 
 def rows(rim, seed):
-    """Rows of the table: run, t, volts, upper, lower."""
+    """Iterate over the rows of the table: run, t, volts, upper, lower."""
     rng = np.random.default_rng(seed)
     for run, (volts, start) in enumerate(zip(RUNS, STARTS, strict=True)):
         seen = solved(volts, start, rim) + NOISE * rng.normal(size=(SAMPLES, 2))
@@ -95,7 +96,7 @@ unit = "V"
 
 
 def write(path, rim=RIM, seed=2):
-    """The table at `path`, and what describes it beside."""
+    """Write the table to `path`, and its description next to it."""
     with open(path, "w", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(["run", "t", "volts", "upper", "lower"])

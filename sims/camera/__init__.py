@@ -1,1 +1,1 @@
-"""A camera that films a ball, the films it makes, and what a tracker sees in them."""
+"""Films of a ball: camera model, rendering, and tracking."""

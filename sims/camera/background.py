@@ -1,4 +1,4 @@
-"""What a fixed camera sees when the ball is not there, and where the film is cut."""
+"""Background image of a fixed camera without the ball, and the cuts of a film."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from sims.base import Array, InputError
 from sims.camera.render import Image
 
 MOST = 25
-"""Frames of which the background is the median."""
+"""Maximum number of frames whose median is the background."""
 _PIXELS = 5_000
-"""Pixels of a picture that the first pass looks at, about."""
+"""Approximate number of pixels per picture used in the first pass."""
 _CUT = 0.5
-"""Share of the pixels that change where the film is cut or the camera moves."""
+"""Fraction of pixels that change where the film is cut or the camera moves."""
 _STEP = 12
-"""Grey levels; less is noise or a shadow's edge, and no other picture."""
+"""Change in grey levels above which a pixel counts as changed; smaller ones are noise or shadow."""
 _GRAIN = 4
-"""Grey levels of compression beyond the camera's noise, which is told by the median."""
+"""Grey levels of compression noise in addition to the camera noise, which the median estimates."""
 _NEAR = 1.3
-"""Of a ball's radius: how far around its middle it hides the background, with its soft edge."""
+"""Distance around a ball's centre at which it hides the background with its soft edge, in radii."""
 _EDGE = 3
-"""Pixels beyond that, which compression spoils."""
+"""Additional margin around a ball that compression affects, pixels."""
 _NORMAL = 1.4826
-"""Standard deviations of normal noise in its median magnitude."""
+"""Standard deviation of normal noise divided by its median magnitude."""
 _WORST = 1.5
-"""The largest of three such magnitudes is taken for so many times one of them."""
+"""Assumed ratio of the largest of three noise magnitudes to a single one."""
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What a first pass over the frames tells.
+    """Result of a first pass over the frames.
 
     Attributes:
-        times: (n,) seconds.
-        moved: (n,) how much changed from the frame before, mean grey levels.
-        cuts: numbers of the frames with which another picture begins.
-        size: width and height, px.
+        times: (n,) times of the frames, s.
+        moved: (n,) mean change from the previous frame, grey levels.
+        cuts: Numbers of the frames that begin a new shot.
+        size: Width and height of the picture, px.
     """
 
     times: Array
@@ -49,17 +49,20 @@ class Survey:
     size: tuple[int, int]
 
     def shots(self) -> list[tuple[int, int]]:
-        """First and behind the last frame between cuts."""
+        """Return the first frame and the end (exclusive) of each shot between cuts."""
         edges = [0, *self.cuts, len(self.times)]
-        # none between two cuts in a row
+        # Consecutive cuts have no shot between them.
         return [(a, b) for a, b in pairwise(edges) if b > a]
 
 
 def survey(frames: Iterable[tuple[float, Image]]) -> Survey:
-    """Look at every frame once, coarsely.
+    """Measure the change between consecutive frames at low resolution.
+
+    Args:
+        frames: Time in seconds and picture (height, width, 3) of each frame.
 
     Raises:
-        InputError: the picture changes its size.
+        InputError: The size of the picture changes.
     """
     times = []
     moved = []
@@ -79,10 +82,10 @@ def survey(frames: Iterable[tuple[float, Image]]) -> Survey:
         change = np.abs(coarse - earlier).max(axis=2)
         if np.mean(change > _STEP) > _CUT:
             cuts.append(number)
-            # what changed is the picture, and no ball has moved
+            # The whole picture has changed, and no ball has moved.
             change[:] = 0
         times.append(time)
-        # small changes are noise; they would make a resting picture look busy
+        # Ignore small changes: noise would make a static picture look busy.
         usual = np.median(change)
         beyond = change - 2 * usual - _GRAIN
         moved.append(float(np.maximum(beyond, 0).mean()))
@@ -91,12 +94,20 @@ def survey(frames: Iterable[tuple[float, Image]]) -> Survey:
 
 
 def chosen(moved: Array, most: int = MOST) -> list[int]:
-    """Numbers of at most `most` frames evenly spaced in how much has moved until then.
+    """Select frames at even intervals of accumulated motion.
 
-    Evenly in time, a ball that comes to rest would be in most of them and so in the median.
+    Frames at even intervals of time would mostly show a ball that comes to rest, which would then
+    be part of the median.
+
+    Args:
+        moved: (n,) mean change from the previous frame, grey levels.
+        most: Maximum number of frames.
+
+    Returns:
+        Sorted numbers of the frames.
     """
     count = len(moved)
-    # a little for every frame, so that a film in which nothing moves still has marks
+    # A small value for each frame, so that a film without motion has marks, too.
     least = 1e-3 * moved.sum() / max(1, count)
     way = np.cumsum(moved + least + 1e-12)
     marks = np.linspace(way[0], way[-1], min(most, count))
@@ -105,10 +116,10 @@ def chosen(moved: Array, most: int = MOST) -> list[int]:
 
 
 def median(pictures: list[Image]) -> Image:
-    """The median of pictures, pixel by pixel."""
+    """Return the pixelwise median of pictures."""
     stack = np.stack(pictures)
     half = len(stack) // 2
-    # a partition finds the middle without sorting, and stays in whole grey levels
+    # A partition finds the middle without sorting, and keeps integer grey levels.
     stack.partition(half, axis=0)
     result: Image = stack[half].copy()
     return result
@@ -120,13 +131,13 @@ def without(
     before: Image,
     shaded: NDArray[np.bool_] | None = None,
 ) -> Image:
-    """The median without what hides the background; `before` where none is left.
+    """Return the median of pictures without the objects that hide the background.
 
     Args:
-        pictures: n of them, (height, width, 3).
-        balls: each picture's (u, v, radius).
-        before: the background as it was taken to be.
-        shaded: (n, height, width) where shadow is besides.
+        pictures: Pictures (height, width, 3), n of them.
+        balls: Circles (u, v, radius) of the objects in each picture, pixels.
+        before: Previous estimate of the background, used where no picture shows it.
+        shaded: Mask (n, height, width) of shadows that also hide it; None for none.
     """
     height, width = before.shape[:2]
     rows, columns = np.mgrid[:height, :width]
@@ -136,23 +147,21 @@ def without(
         for u, v, radius in there:
             far = np.hypot(columns - u, rows - v)
             mask |= far < _NEAR * radius + _EDGE
-    # elsewhere the median stands: never hidden, or hidden in all pictures
+    # Elsewhere the median is kept: pixels that are never hidden, or hidden in all pictures.
     ever = hidden.any(axis=0) & ~hidden.all(axis=0)
     colours = np.stack(pictures)[:, ever].astype(np.float32)
     values = np.where(hidden[:, ever, None], np.nan, colours)
     result = before.copy()
     if ever.any():
         middle = _median_of_seen(values)
-        # half a level, since the conversion to whole ones cuts off
+        # Add half a grey level, because the conversion to integers truncates.
         result[ever] = (middle + 0.5).astype(np.uint8)
     return result
 
 
 def _median_of_seen(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The median over the first axis without NaN, of which not all are; numpy's own takes four
-    times as long.
-    """
-    # NaN come last, so the count of the others says where the middle is
+    """Return the median over the first axis, ignoring NaN; numpy's takes four times as long."""
+    # NaN are sorted last, so the number of other values determines the middle.
     ranked = np.sort(values, axis=0)
     count = np.isfinite(values).sum(axis=0, keepdims=True)
     low = np.take_along_axis(ranked, (count - 1) // 2, axis=0)
@@ -162,18 +171,24 @@ def _median_of_seen(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def noise(pictures: list[Image], background: Image) -> float:
-    """1 sigma of the camera in grey levels of its worst colour, from pictures in which little
-    differs.
+    """Estimate the camera noise from pictures in which little differs from the background.
+
+    Args:
+        pictures: Pictures (height, width, 3).
+        background: Background (height, width, 3).
+
+    Returns:
+        Standard deviation in grey levels of the worst colour.
     """
-    # a few tell: each has as many numbers as pixels
+    # A few pictures suffice, because each has many pixels.
     every = max(1, len(pictures) // 8)
     worst = [_difference(picture, background) for picture in pictures[::every]]
     return float(_NORMAL * np.median(np.stack(worst)) / _WORST)
 
 
 def _difference(picture: Image, background: Image) -> NDArray[np.int16]:
-    """The largest difference (height, width) over the colours."""
-    # whole numbers without sign would wrap round
+    """Return the largest difference over the colours (height, width)."""
+    # Unsigned integers would wrap around.
     signed = picture.astype(np.int16)
     apart = np.abs(signed - background)
     result: NDArray[np.int16] = apart.max(axis=2)

@@ -1,10 +1,10 @@
-"""A pinhole camera: where a point of the world, or a ball, appears in the picture.
+"""Pinhole camera: where a point of the world, or a ball, appears in the picture.
 
-Pixels are (u, v): u to the right, v down, (0, 0) the centre of the upper left pixel, as OpenCV
-counts them. World coordinates are metres, z up. Pixels are square and the lens does not distort.
+Pixels are (u, v): u to the right, v down, (0, 0) the centre of the upper left pixel, as in OpenCV.
+World coordinates are in metres, z up. Pixels are square and the lens has no distortion.
 
 With (X, Y, Z) a point in the camera's frame (right, down, depth), f the focal length in pixels and
-(u0, v0) the pixel of the optical axis:
+(u0, v0) the pixel of the optical axis (the principal point):
 
     (1)  (X, Y, Z) = axes (point - position)
     (2)  u = u0 + f X / Z,  v = v0 + f Y / Z
@@ -15,12 +15,12 @@ distance d, seen at the angle t from the optical axis, fills a cone of half angl
 
     (4)  sin p = r / d
 
-whose section with the picture plane Z = 1 is an ellipse, its long axis on the line to the middle of
-the picture, from tan(t - p) to tan(t + p):
+The section of this cone with the picture plane Z = 1 is an ellipse whose long axis is on the line
+to the principal point, from tan(t - p) to tan(t + p):
 
     (5)  centre a = (tan(t - p) + tan(t + p)) / 2,  half length (tan(t + p) - tan(t - p)) / 2
 
-and half width b, from a point (a, b, 1) of the cone, the axis of which is (sin t, 0, cos t):
+Its half width b follows from a point (a, b, 1) of the cone, whose axis is (sin t, 0, cos t):
 
     (6)  (a sin t + cos t)^2 = cos(p)^2 (a^2 + b^2 + 1)
 """
@@ -37,20 +37,20 @@ from numpy.typing import ArrayLike
 from sims.base import Array, InputError, frozen
 
 _REFINEMENTS = 4
-"""Rounds in which the offset between outline and projected centre is taken off."""
+"""Number of iterations in which the offset between outline and projected centre is subtracted."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera that stands `distance` from the vertical through its target and looks at it.
+    """Camera at the horizontal distance `distance` from its target, directed at the target.
 
     Attributes:
-        azimuth: rad, where it stands around that vertical, from x towards y.
-        distance: m, from that vertical.
-        height: m, above the ground.
-        target: m, the point it looks at, which appears in the middle of the picture.
-        field_of_view: degrees, from the lower to the upper edge of the picture.
-        size: pixels, width and height.
+        azimuth: Direction from the target to the camera about the vertical, from x towards y, rad.
+        distance: Distance from the vertical through the target, m.
+        height: Height above the ground, m.
+        target: Point in the middle of the picture (x, y, z), m.
+        field_of_view: Angle from the lower to the upper edge of the picture, degrees.
+        size: Width and height of the picture, pixels.
     """
 
     azimuth: float
@@ -70,7 +70,7 @@ class Camera:
         ]
         if not np.isfinite(numbers).all():
             raise InputError(f"camera: expected finite numbers, found {numbers}")
-        # seen from straight above, the picture would have no upright
+        # From straight above, the upright direction of the picture would be undefined.
         if self.distance <= 0:
             raise InputError(f"camera: distance: expected more than 0 m, found {self.distance:g}")
         angle = self.field_of_view
@@ -81,14 +81,14 @@ class Camera:
 
     @classmethod
     def published(cls, rng: np.random.Generator, pixels: int = 100) -> Camera:
-        """A camera drawn as for the published visual tuner.
+        """Draw a camera as for the published visual tuner.
 
         Azimuth U[0, 2 pi], distance U[5, 10] m, height U[5, 8] m, aimed at (0, 0, 2), field of view
         40 degrees, 100 x 100 px (Allevato et al., TuneNet, arXiv 1907.11200, released code).
 
         Args:
-            rng: what is drawn comes from here.
-            pixels: width and height of the picture.
+            rng: Random number generator.
+            pixels: Width and height of the picture.
         """
         low = 0.0, 5.0, 5.0
         high = 2 * math.pi, 10.0, 8.0
@@ -96,12 +96,17 @@ class Camera:
         return cls(azimuth, distance, height, size=(pixels, pixels))
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera with other pixels; the field of view from lower to upper edge stays."""
+        """Return this camera with another picture size and the same vertical field of view.
+
+        Args:
+            width: Width of the picture, pixels.
+            height: Height of the picture, pixels.
+        """
         return replace(self, size=(width, height))
 
     @cached_property
     def position(self) -> Array:
-        """Where it stands (3,), m."""
+        """Position of the camera (3,), m."""
         x, y, _ = self.target
         x += self.distance * math.cos(self.azimuth)
         y += self.distance * math.sin(self.azimuth)
@@ -115,17 +120,15 @@ class Camera:
 
     @cached_property
     def middle(self) -> Array:
-        """The pixel (2,) of the optical axis."""
-        # pixels are counted from their centres, so the middle of 100 is 49.5
+        """Principal point: the pixel (2,) of the optical axis."""
+        # Pixel coordinates refer to pixel centres, so the middle of 100 pixels is 49.5.
         width, height = self.size
         return frozen([(width - 1) / 2, (height - 1) / 2])
 
     @cached_property
     def axes(self) -> Array:
-        """Rows: the picture's right, its down, and the viewing direction, as unit vectors of the
-        world (3, 3).
-        """
-        # up in the picture is up in the world as far as the view allows
+        """Axes of the camera as unit vectors of the world (3, 3), in rows: right, down, forward."""
+        # The vertical of the world is upright in the picture.
         forward = np.asarray(self.target) - self.position
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, (0.0, 0.0, 1.0))
@@ -134,40 +137,44 @@ class Camera:
         return frozen([right, down, forward])
 
     def seen(self, points: ArrayLike) -> Array:
-        """World points (..., 3) in the camera's frame (..., 3), m: right, down, depth."""
+        """Transform world points (..., 3) to the camera's frame (..., 3), m: right, down, depth."""
         away = np.asarray(points, dtype=np.float64) - self.position
         result: Array = away @ self.axes.T  # (1)
         return result
 
     def depth(self, points: ArrayLike) -> Array:
-        """Distance (...) of world points (..., 3) from the camera along its axis, m; negative
-        behind it.
+        """Return the depths (...) of world points (..., 3) along the optical axis, m.
+
+        Depths are negative behind the camera.
         """
         result: Array = self.seen(points)[..., 2]
         return result
 
     def project(self, points: ArrayLike) -> Array:
-        """Pixels (..., 2) where world points (..., 3) appear, inside the picture or not; NaN behind
-        the camera.
+        """Project world points (..., 3) to pixels (..., 2).
+
+        Pixels may be outside the picture; they are NaN for points behind the camera.
         """
         seen = self.seen(points)
         depth = seen[..., 2:]
-        # what is behind would appear turned about the middle
+        # Points behind the camera would appear mirrored about the principal point.
         depth = np.where(depth > 0, depth, np.nan)
         result: Array = self.middle + self.focal * seen[..., :2] / depth  # (2)
         return result
 
     def outline(self, points: ArrayLike, radius: float) -> tuple[Array, Array]:
-        """The ellipse as which a sphere appears: its centre (..., 2) and semi-axes (..., 2), the
-        longer first, px.
+        """Return the ellipse that is the outline of a sphere in the picture.
 
-        The longer axis points to the middle of the picture, and the centre lies a little further
-        out than the projection of the sphere's own centre.
+        The longer axis points to the middle of the picture, and the centre is slightly further from
+        it than the projection of the sphere's own centre.
 
         Args:
-            points: centres (..., 3), m; NaN comes back for one that is not wholly before the
-                camera.
-            radius: of the sphere, m.
+            points: Centres of the sphere (..., 3), m.
+            radius: Radius of the sphere, m.
+
+        Returns:
+            Centre (..., 2) and semi-axes (..., 2) of the ellipse in pixels, the longer axis first;
+            NaN where the sphere is not wholly in front of the camera.
         """
         seen = self.seen(points)
         sideways = seen[..., :2]
@@ -177,7 +184,7 @@ class Camera:
         with np.errstate(invalid="ignore", divide="ignore"):
             half = np.arcsin(radius / far)  # (4)
             tilt = np.arctan2(aside, depth)
-            # a cone that reaches the plane of the camera itself has no ellipse
+            # The section is no ellipse if the cone reaches the plane of the camera.
             tilt = np.where(tilt + half < math.pi / 2, tilt, np.nan)
             near_end = np.tan(tilt - half)
             far_end = np.tan(tilt + half)
@@ -185,7 +192,7 @@ class Camera:
             lean = away * np.sin(tilt) + np.cos(tilt)
             ratio = lean / np.cos(half)
             across = ratio**2 - away**2 - 1  # (6), b^2
-            # in the middle of the picture any direction will do
+            # In the middle of the picture the direction is arbitrary.
             divisor = np.where(aside > 0, aside, 1.0)
             direction = sideways / divisor[..., None]
         centre = self.middle + self.focal * away[..., None] * direction
@@ -194,24 +201,37 @@ class Camera:
         return centre, self.focal * np.stack([longer, shorter], axis=-1)
 
     def apparent_radius(self, points: ArrayLike, radius: float) -> Array:
-        """Radius (...) in pixels of the circle that covers as much of the picture as the sphere
-        does.
+        """Return the radius (...) in pixels of the circle with the area of the sphere's outline.
+
+        Args:
+            points: Centres of the sphere (..., 3), m.
+            radius: Radius of the sphere, m.
         """
         axes = self.outline(points, radius)[1]
         result: Array = np.sqrt(axes[..., 0] * axes[..., 1])
         return result
 
     def heights(self, centres: ArrayLike, x: float, y: float, radius: float) -> Array:
-        """Heights (...) at which a ball on the vertical through (x, y) has its outline nearest to
-        `centres` (..., 2).
+        """Estimate the heights of a ball on a vertical line from the centres of its outlines.
 
-        A point on that vertical is linear in z, base + z up, so both equations (2) are when
-        multiplied by Z; with k = (u - u0, v - v0) / f they read
+        A point on that vertical is linear in z, base + z up. Multiplied by Z, both equations (2)
+        are
+        linear in z; with k = (u - u0, v - v0) / f they read
 
             (7)  (base_XY - k base_Z) + z (up_XY - k up_Z) = 0
 
         and are solved for z by least squares. The small offset between outline and projected centre
-        is taken off in a few rounds.
+        is
+        subtracted iteratively.
+
+        Args:
+            centres: Centres of the outlines (..., 2), pixels.
+            x: Horizontal position of the vertical line, m.
+            y: Horizontal position of the vertical line, m.
+            radius: Radius of the ball, m.
+
+        Returns:
+            Heights (...) of the ball's centre, m.
         """
         pixels = np.asarray(centres, dtype=np.float64)
         base = self.seen((x, y, 0.0))

@@ -1,12 +1,12 @@
-"""A circle through points of an edge of which a part is something else's.
+"""Robust circle fit to points of an edge, some of which belong to other objects.
 
-With d a point's distance from the middle (u, v), R the radius and n = (x - u, y - v) / d:
+With d a point's distance from the centre (u, v), R the radius and n = (x - u, y - v) / d:
 
     (1)  rest = d - R
-    (2)  Gauss-Newton: rest = n . (du, dv) + dR, by weighed least squares
+    (2)  Gauss-Newton: rest = n . (du, dv) + dR, by weighted least squares
     (3)  Tukey's weights: (1 - (rest / width)^2)^2, zero beyond the width
 
-and for a start Kasa's linear fit, with doubled middle (2 u, 2 v):
+and for the initial circle Kasa's linear fit, with doubled centre (2 u, 2 v):
 
     (4)  x^2 + y^2 = 2 u x + 2 v y + (R^2 - u^2 - v^2)
 """
@@ -19,46 +19,50 @@ from numpy.typing import NDArray
 from sims.base import Array
 
 Circle = tuple[float, float, float]
-"""Middle and radius (u, v, radius), pixels."""
+"""Centre and radius (u, v, radius), pixels."""
 Fitted = tuple[Circle, Array]
-"""A circle, and each point's distance to it, > 0 outside."""
+"""Circle, and each point's distance to it, > 0 outside."""
 
 _TURNS = 8
-"""Steps of Gauss-Newton at most."""
+"""Maximum number of Gauss-Newton steps."""
 _EXACT = 1e-3
-"""Pixels; a step as short as this is the last."""
+"""Length of a step, in pixels, below which the iteration ends."""
 _EVERY = 3
-"""Points from the beginning of one arc to that of the next."""
+"""Number of points between the beginnings of consecutive arcs."""
 _TUKEY = 4.7
-"""Width of Tukey's weights in standard deviations, for 95 % efficiency on normal errors."""
+"""Width of Tukey's weights in standard deviations, for 95 % efficiency with normal errors."""
 _NORMAL = 1.4826
-"""Standard deviations of a normal distribution in its median distance from zero."""
+"""Standard deviation of a normal distribution divided by its median absolute deviation."""
 _FINEST = 0.15
-"""Pixels; edges are not found better than that, so that good ones are not thinned out."""
+"""Lower limit of the estimated edge noise in pixels, so that good points are not rejected."""
 _SINGULAR = 1e-6
-"""Determinants below this belong to points that do not fix a circle."""
+"""Determinant below which the points do not determine a circle."""
 _LEAST_RADIUS = 0.5
-"""Pixels."""
+"""Minimum radius, pixels."""
 _MOST_RADIUS = 1e4
-"""Pixels; beyond it the points lie on a straight line."""
+"""Maximum radius in pixels; with a larger one, the points are on a straight line."""
 
 
 def fit(points: Array, start: tuple[float, float, float | None] | None) -> Fitted | None:
-    """The circle nearest to most of the points, by Gauss-Newton with Tukey's weights; None where
-    there is none.
+    """Fit a circle to most of the points by Gauss-Newton with Tukey's weights.
 
-    The normal equations of (2) are solved by hand: numpy's own solver spends its time on the call.
+    The normal equations of (2) are solved explicitly, because the call of numpy's solver would take
+    most of the time.
 
     Args:
-        points: (n, 2).
-        start: where to begin; the median distance where it has no radius.
+        points: Points (n, 2), pixels.
+        start: Initial centre and radius; without radius, the median distance from the centre is
+            used. None if there is no initial circle.
+
+    Returns:
+        The circle and the distances of all points; None if no circle is found.
     """
     if start is None:
         return None
     u, v, radius = start
     x = points[:, 0]
     y = points[:, 1]
-    # columns of (2): the two of n, one for dR, which stays 1, and the rest
+    # Rows: the two components of n, ones for dR, and the residual of (2).
     count = len(points)
     rows: Array = np.ones((4, count))
     for _ in range(_TURNS):
@@ -89,11 +93,11 @@ def fit(points: Array, start: tuple[float, float, float | None] | None) -> Fitte
 
 
 def _step(normal: Array) -> tuple[float, float, float] | None:
-    """(du, dv, dR) of (2) from its weighed products (4, 4); None where they fix none."""
+    """Return (du, dv, dR) of (2) from its weighted products (4, 4); None if they are singular."""
     (xx, xy, mx, p), (_, yy, my, q), (_, _, total, r), _ = normal.tolist()
     if total <= 0:
         return None
-    # dR is eliminated first (Schur's complement); two equations in du and dv are left
+    # Eliminate dR by the Schur complement; two equations in du and dv remain.
     a = xx - mx * mx / total
     b = xy - mx * my / total
     c = yy - my * my / total
@@ -109,7 +113,7 @@ def _step(normal: Array) -> tuple[float, float, float] | None:
 
 
 def agreeing(fitted: Fitted) -> NDArray[np.bool_]:
-    """Which of the points lie on it."""
+    """Return which of the points are on the circle, as a mask (n,)."""
     (_, _, radius), rest = fitted
     tolerance = max(0.7, 0.1 * radius)
     result: NDArray[np.bool_] = np.abs(rest) < tolerance
@@ -117,27 +121,38 @@ def agreeing(fitted: Fitted) -> NDArray[np.bool_]:
 
 
 def better(one: Fitted | None, other: Fitted | None) -> Fitted | None:
-    """The circle on which more of the points lie."""
+    """Return the circle that has more of the points on it.
+
+    Args:
+        one: First circle, or None.
+        other: Second circle, or None.
+
+    Returns:
+        The better circle; None if both are None.
+    """
     if one is None or other is None:
         return one or other
     return other if agreeing(other).sum() > agreeing(one).sum() else one
 
 
 def through_an_arc(points: Array) -> Circle | None:
-    """The circle through half of the points, one after another, on which most of all of them lie.
+    """Fit circles to arcs of consecutive points, and return the one with most points on it.
 
-    What spoils an edge, a shadow or another ball, spoils it on one side. Circles are fitted to arcs
-    that begin all around, by linear least squares (I. Kasa, IEEE Trans. Instrum. Meas. 25, 8, 1976,
-    doi:10.1109/TIM.1976.6312298).
+    A shadow or another ball disturbs one side of an edge. Circles are fitted to arcs of half of the
+    points that begin all around, by linear least squares (I. Kasa, IEEE Trans. Instrum. Meas. 25,
+    8, 1976, doi:10.1109/TIM.1976.6312298).
 
     Args:
-        points: (n, 2), in their order around it.
+        points: Points (n, 2), in their order along the edge, pixels.
+
+    Returns:
+        The circle; None if an arc does not determine one.
     """
     count = len(points)
     begins = np.arange(0, count, _EVERY)
     along = np.arange(count // 2 + 1)
     numbers = (begins[:, None] + along) % count
-    # from their mean, since the squares in (4) lose digits far from the origin
+    # Relative to the mean, because the squares in (4) lose digits far from the origin.
     middle = points.mean(axis=0)
     arcs = points[numbers] - middle
     table = np.concatenate([arcs, np.ones((*numbers.shape, 1))], axis=2)
@@ -154,7 +169,7 @@ def through_an_arc(points: Array) -> Circle | None:
     x, y = (points - middle).T
     far = np.hypot(x - u[:, None], y - v[:, None])
     away = far - radius[:, None]
-    # twice as strict as `agreeing`: points graze the circle of a wrong arc
+    # Half the tolerance of `agreeing`: points graze the circle of a wrong arc.
     tolerance = np.maximum(0.35, 0.05 * radius)
     agree = np.abs(away) < tolerance[:, None]
     best = int(agree.sum(axis=1).argmax())
@@ -166,7 +181,7 @@ def through_an_arc(points: Array) -> Circle | None:
 
 
 def _middle(values: Array) -> float:
-    """The median; numpy's own takes ten times as long for a few numbers."""
+    """Return the median; numpy's own takes ten times as long for a few numbers."""
     k = len(values) // 2
     sorted_there = np.partition(values, (k - 1, k))
     if len(values) % 2:

@@ -1,6 +1,4 @@
-"""What stands beside a film made here, `NAME.camera.toml`: the camera, and the ball and the
-vertical it falls along.
-"""
+"""Read and write `NAME.camera.toml`, which describes the camera and the ball of a rendered film."""
 
 from __future__ import annotations
 
@@ -14,15 +12,15 @@ from sims.camera.camera import Camera
 from sims.user_toml import fault, finite, known, numbers, read_toml, table
 
 _CAMERA = {"azimuth": 1, "distance": 1, "height": 1, "field_of_view": 1, "target": 3, "size": 2}
-"""Entries of [camera], with how many numbers each has."""
+"""Entries of [camera] and how many numbers each has."""
 
 _BALL = {"radius": 1, "x": 1, "y": 1}
-"""Entries of [ball]."""
+"""Entries of [ball] and how many numbers each has."""
 
 
 @dataclass(frozen=True)
 class Filmed:
-    """A camera, and what it films: a ball of `radius` [m] on the vertical through x, y [m]."""
+    """Camera, and a ball of `radius` [m] on the vertical through x, y [m]."""
 
     camera: Camera
     radius: float
@@ -31,12 +29,12 @@ class Filmed:
 
 
 def beside(video: Path) -> Path:
-    """Where the description of a film's camera stands."""
+    """Return the path of the camera description of a film."""
     return video.with_suffix(".camera.toml")
 
 
 def described(filmed: Filmed) -> str:
-    """The text of `NAME.camera.toml`."""
+    """Format the text of `NAME.camera.toml`."""
     import tomli_w
 
     camera = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(filmed.camera).items()}
@@ -49,15 +47,15 @@ def read_filmed(path: Path) -> Filmed:
     """Read `NAME.camera.toml`.
 
     Raises:
-        InputError: anything malformed, in one line.
+        InputError: The file is malformed; the message is one line.
     """
     meta = read_toml(path)
-    # All of it is stated: a camera that is half a default would give wrong metres without a word.
+    # All entries are required: a partly default camera would give wrong lengths silently.
     camera = _values(path, "camera", meta, _CAMERA)
     ball = _values(path, "ball", meta, _BALL)
     if ball["radius"] <= 0:
         raise fault(path, "ball.radius", "more than 0 m", ball["radius"])
-    # Pixels are counted; TOML gives every number as it was written.
+    # Sizes are integers, but may be written as floats in TOML.
     camera["size"] = tuple(int(n) for n in camera["size"])
     try:
         return Filmed(Camera(**camera), **ball)
@@ -68,7 +66,7 @@ def read_filmed(path: Path) -> Filmed:
 def _values(
     path: Path, section: str, meta: Mapping[str, Any], counts: Mapping[str, int]
 ) -> dict[str, Any]:
-    """The entries of a section, every one of them: a number, or as many as are counted."""
+    """Read all entries of a section, each a number or a tuple of the required length."""
     given = table(path, section, meta.get(section))
     known(f"entry in [{section}] of {path}", given, counts)
     values: dict[str, Any] = {}

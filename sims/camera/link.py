@@ -1,4 +1,4 @@
-"""Spots of many pictures joined to the paths of the things that made them."""
+"""Link the detections in many frames to paths, one path for each moving object."""
 
 from __future__ import annotations
 
@@ -11,38 +11,44 @@ from sims.base import Array
 from sims.camera.spots import Spot
 
 _PATIENCE = 15
-"""Pictures for which a thing may be lost from view and still be the same."""
+"""Maximum number of consecutive frames in which an object may be missed."""
 _ALIKE = (0.65, 1.55)
-"""Between these a radius may be of another picture's: the way towards the camera, and blur."""
+"""Range of the ratio of two radii of one object, which approaches the camera or is blurred."""
 _LEAST = 3
-"""Pictures that show a thing; what fewer show is noise."""
+"""Minimum number of frames of a path; shorter ones are noise."""
 _CHANCE = 0.5
-"""Share of the rays that agree on a circle by chance."""
+"""Fraction of the rays that agree on a circle by chance."""
 _MEMORY = 20
-"""Pictures over which the colour of a path is averaged."""
+"""Number of frames over which the colour of a path is averaged."""
 _TINGE = 25.0
-"""Grey levels by which a thing's colour may vary."""
+"""Tolerance of the colour of an object, in grey levels."""
 _SHARE = 0.45
-"""Share of its contrast with the background by which it may vary as well."""
+"""Tolerance of the colour of an object, as a fraction of its contrast with the background."""
 _BEHIND = 3
-"""Median radii from a path's line within which another path may be its continuation."""
+"""Maximum distance of a continuation from the line of a path, in median radii."""
 _BLEEDS = 1.5
-"""Pixels over which video files, which keep colours at half the resolution, mix a ball's with the
-background's.
+"""Width in pixels over which video files mix the colours of ball and background.
+
+Video files store colours at half the resolution.
 """
 
 
 @dataclass
 class Path:
-    """One thing's way: numbers of the pictures that show it, and where."""
+    """Path of one object: frame numbers, detections and mean colour."""
 
     frames: list[int] = field(default_factory=list)
     spots: list[Spot] = field(default_factory=list)
     tone: Array = field(default_factory=lambda: np.zeros(3))
 
     def add(self, frame: int, spot: Spot) -> None:
-        """Go on with a spot of one more picture."""
-        # a plain mean at first, later one that forgets: light changes along the way
+        """Append a detection, and update the mean colour.
+
+        Args:
+            frame: Number of the frame.
+            spot: Detection in that frame.
+        """
+        # A plain mean at first, later an exponential one, because the light changes along the path.
         count = len(self.spots) + 1
         weight = 1.0 / min(count, _MEMORY)
         colour = np.array(spot.colour)
@@ -51,12 +57,18 @@ class Path:
         self.spots.append(spot)
 
     def expected(self, frame: int) -> tuple[float, float, float]:
-        """Where it should be if it goes on straight (u, v), and how far from there it may be: a
-        bounce turns it.
+        """Predict the position in a frame by linear extrapolation.
+
+        Args:
+            frame: Number of the frame.
+
+        Returns:
+            Position (u, v), and the maximum distance of a detection from it, which allows for a
+            bounce; pixels.
         """
         last = self.spots[-1]
         u, v = last.u, last.v
-        # of one picture nobody knows where it goes
+        # A single detection has no direction.
         if len(self.spots) < 2:
             return u, v, 4 * last.radius + 10
         before = self.spots[-2]
@@ -64,17 +76,21 @@ class Path:
         du = (u - before.u) / gap
         dv = (v - before.v) / gap
         wait = frame - self.frames[-1]
-        # twice the way: one that turns round is as far from where it should be
+        # Twice the distance covered: an object that reverses is that far from its prediction.
         speed = float(np.hypot(du, dv))
         reach = 2 * speed * wait + last.radius + 2
         return u + du * wait, v + dv * wait, reach
 
     def near(self, frame: int, spot: Spot) -> float:
-        """Distance of a spot from where this should be, as a share of what is allowed; infinite for
-        another thing.
+        """Return the distance of a detection from this path as a fraction of the allowed one.
 
-        Where a ball meets its shadow and leaves it again, the shadow goes on as the ball went
-        before; its colour tells.
+        Position, radius and colour count; the result is infinite for another object. Colour
+        separates a ball from its shadow where they meet and the shadow continues as the ball moved
+        before.
+
+        Args:
+            frame: Number of the frame.
+            spot: Detection in that frame.
         """
         u, v, reach = self.expected(frame)
         off = float(np.hypot(spot.u - u, spot.v - v)) / reach
@@ -87,10 +103,15 @@ class Path:
         return off + unlike if unlike <= 1 else np.inf
 
     def unlike(self, colour: Sequence[float], contrast: float) -> float:
-        """How far a colour is from this one's, as a share of what light and compression may do to
-        it.
+        """Return the difference of a colour from that of the path as a fraction of the tolerance.
+
+        The tolerance allows for light and compression.
+
+        Args:
+            colour: Red, green, blue, grey levels.
+            contrast: Contrast with the background of the object of that colour, grey levels.
         """
-        # the smaller the ball, the more of it is mixed with the background
+        # The smaller the ball, the more of it is mixed with the background.
         tinge = _TINGE * (1.0 + _BLEEDS / self.spots[-1].radius)
         allowed = max(
             tinge,
@@ -102,57 +123,68 @@ class Path:
 
     @property
     def contrast(self) -> float:
-        """Of its last picture."""
+        """Contrast of the last detection with the background, grey levels."""
         return self.spots[-1].contrast
 
     @property
     def radius(self) -> float:
-        """Its median radius."""
+        """Median radius of the detections, pixels."""
         return float(np.median([s.radius for s in self.spots]))
 
     @property
     def places(self) -> Array:
-        """Middles (n, 2)."""
+        """Centres of the detections (n, 2), pixels."""
         return np.array([(s.u, s.v) for s in self.spots])
 
     @property
     def travel(self) -> float:
-        """How far it gets, corner to corner of what it visits, in pixels."""
+        """Extent of the path, as the diagonal of its bounding box in pixels."""
         spans = np.ptp(self.places, axis=0)
         return float(np.linalg.norm(spans))
 
     @property
     def weight(self) -> float:
-        """How much speaks for it: edge, in pixels, that lies on circles beyond what chance lays
-        there.
+        """Evidence for the path: length of edge on circles beyond chance level, in pixels.
 
-        Counted in pictures alone, a remnant of shadow that is there all the time would outweigh a
-        ball.
+        A count of frames alone would prefer a permanent remnant of shadow to a ball.
         """
         return sum((spot.agree - _CHANCE) * spot.radius for spot in self.spots)
 
 
 def linked(pictures: Sequence[Sequence[Spot]]) -> list[Path]:
-    """The paths in a film, the best first; short ones are left out."""
+    """Link detections to paths, the best path first; short paths are left out.
+
+    Args:
+        pictures: Detections in each frame.
+    """
     done: list[Path] = []
     live: list[Path] = []
     for frame, spots in enumerate(pictures):
         done += [path for path in live if frame - path.frames[-1] > _PATIENCE]
         live = [path for path in live if frame - path.frames[-1] <= _PATIENCE]
         taken = _continued(live, frame, spots)
-        # what continues nothing begins something
+        # Each remaining detection begins a new path.
         for k, spot in enumerate(spots):
             if k not in taken:
                 path = Path()
                 path.add(frame, spot)
                 live.append(path)
     paths = [path for path in done + live if len(path.frames) >= _LEAST]
-    # what stays where it is comes last, whatever speaks for it
+    # Objects that do not move come last, regardless of their evidence.
     return sorted(paths, key=lambda path: -path.weight * (path.travel > path.radius))
 
 
 def _continued(live: Sequence[Path], frame: int, spots: Sequence[Spot]) -> set[int]:
-    """Add each spot to the path that it suits best; the numbers of the spots that suit one."""
+    """Append each detection to the path that it fits best.
+
+    Args:
+        live: Paths that may continue.
+        frame: Number of the frame.
+        spots: Detections in that frame.
+
+    Returns:
+        Numbers of the detections that were appended.
+    """
     pairs = []
     for i, path in enumerate(live):
         for k, spot in enumerate(spots):
@@ -161,7 +193,7 @@ def _continued(live: Sequence[Path], frame: int, spots: Sequence[Spot]) -> set[i
                 pairs.append((distance, i, k))
     paths: set[int] = set()
     taken: set[int] = set()
-    # the nearest pair first; a path gets one spot, and a spot one path
+    # Nearest pairs first: a path gets one detection, and a detection one path.
     for _, i, k in sorted(pairs):
         if i in paths or k in taken:
             continue
@@ -172,14 +204,21 @@ def _continued(live: Sequence[Path], frame: int, spots: Sequence[Spot]) -> set[i
 
 
 def joined(paths: Sequence[Path]) -> tuple[Path, list[Path]]:
-    """The first path with those that go on where it was lost from view, and the other paths."""
+    """Merge the first path with those that continue it after it was lost from view.
+
+    Args:
+        paths: Paths, the best first.
+
+    Returns:
+        The merged path, and the other paths.
+    """
     main = paths[0]
     others = []
     frames = list(main.frames)
     spots = list(main.spots)
     low, high = _ALIKE
     for path in paths[1:]:
-        # one ball is in one place: what shows in the same picture is another thing
+        # A ball is in one place: a detection in the same frame is another object.
         apart = not set(path.frames) & set(frames)
         alike = low < path.radius / main.radius < high
         alike &= main.unlike(path.tone.tolist(), path.contrast) <= 1
@@ -199,9 +238,14 @@ def joined(paths: Sequence[Path]) -> tuple[Path, list[Path]]:
 
 
 def _aside(line: Array, points: Array) -> float:
-    """Median distance of points from the straight line along which other points lie."""
+    """Return the median distance of points from the line fitted to other points.
+
+    Args:
+        line: Points (n, 2) that determine the line.
+        points: Points (m, 2).
+    """
     middle = line.mean(axis=0)
-    # the last axis is the one across, along which the line's points differ least
+    # The last axis is perpendicular to the line: along it, the points differ least.
     _, _, axes = np.linalg.svd(line - middle, full_matrices=False)
     across = (points - middle) @ axes[-1]
     return float(np.median(np.abs(across)))

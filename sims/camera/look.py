@@ -1,4 +1,4 @@
-"""What a filmed scene looks like: light, colours, noise and compression, drawn by seed."""
+"""Random appearance of a filmed scene: light, colours, noise and compression."""
 
 from __future__ import annotations
 
@@ -10,34 +10,31 @@ import numpy as np
 from sims.base import Array, frozen
 
 _CONTRAST = 0.3
-"""Least difference between ball and ground in some colour, of 1; a ball like its ground cannot be
-seen by anyone.
-"""
+"""Minimum difference between ball and ground in some colour, on a scale from 0 to 1."""
 _WAVES = 6
-"""Waves of which the ground's pattern is the sum."""
+"""Number of waves whose sum is the ground's pattern."""
 _LOWEST = np.pi / 6
-"""rad above the ground, of the light: 30 degrees."""
+"""Minimum elevation of the light, rad (30 degrees)."""
 _HIGHEST = np.pi / 2.25
-"""rad above the ground, of the light: 80 degrees."""
+"""Maximum elevation of the light, rad (80 degrees)."""
 _BALL_VALUE = (0.15, 1.0)
-"""Brightness of balls, of 1: any but black."""
+"""Range of the brightness of balls, on a scale from 0 to 1; black is excluded."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """The look of a scene; colours are red, green, blue from 0 to 1.
+    """Appearance of a scene; colours are red, green, blue from 0 to 1.
 
     Attributes:
-        light: unit vector (3,) towards the light.
-        ball: colour of the ball.
-        ground: colour of the ground.
-        sky: colour above the horizon.
-        waves: the ground's pattern, rows of (wave vector x, y in rad/m, phase, amplitude as a share
-            of brightness).
-        shadow: share of the light that the ball's shadow takes away.
-        noise: of the camera, 1 sigma in grey levels of 255.
-        crf: compression, the encoder's constant rate factor: 0 loses nothing, above 30 it is
-            coarse.
+        light: Unit vector (3,) towards the light.
+        ball: Colour of the ball.
+        ground: Colour of the ground.
+        sky: Colour above the horizon.
+        waves: Pattern of the ground, rows of (wave vector x, y in rad/m, phase in rad, amplitude as
+            a fraction of brightness).
+        shadow: Fraction of the light that the ball's shadow removes.
+        noise: Standard deviation of the camera noise, grey levels of 255.
+        crf: Constant rate factor of the video encoder: 0 is lossless, above 30 is coarse.
     """
 
     light: Array
@@ -51,10 +48,12 @@ class Look:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Look:
-        """A look by chance: light 30 to 80 degrees above the ground, any colours that can be told
-        apart.
+        """Draw a random appearance.
+
+        The light is 30 to 80 degrees above the ground, and the colours of ball and ground are
+        distinguishable.
         """
-        # the order of the draws is part of what a seed means
+        # The order of the draws must not change, because it determines the result of a seed.
         azimuth = rng.uniform(0, 2 * np.pi)
         above = rng.uniform(_LOWEST, _HIGHEST)
         flat = np.cos(above)
@@ -88,7 +87,12 @@ class Look:
         )
 
     def pattern(self, x: Array, y: Array) -> Array:
-        """Brightness of the ground at (x, y), 1 on average, of the arguments' shape."""
+        """Return the brightness of the ground at positions (x, y) in m, 1 on average.
+
+        Args:
+            x: Positions, any shape.
+            y: Positions, of the shape of `x`.
+        """
         bright = np.ones_like(x)
         for kx, ky, phase, amplitude in self.waves:
             bright += amplitude * np.sin(kx * x + ky * y + phase)
@@ -100,5 +104,5 @@ def _colour(
     saturation: tuple[float, float],
     value: tuple[float, float],
 ) -> tuple[float, float, float]:
-    """Any hue, with saturation and value from these ranges."""
+    """Draw a colour with any hue, and with saturation and value in the given ranges."""
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(*value))

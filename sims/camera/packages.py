@@ -1,4 +1,4 @@
-"""The packages that films need; they are an extra, and are imported where they are used."""
+"""Optional packages for films, imported where they are used."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any
 from sims.base import InputError
 
 NEEDED = ("av", "cv2")
-"""PyAV reads and writes video files, OpenCV measures pictures."""
+"""Packages for films: PyAV reads and writes video files, OpenCV measures pictures."""
 
 
 def require(instead: str = "") -> None:
-    """See that films can be made and read, without importing anything.
+    """Check that the packages for films are installed, without importing them.
 
     Args:
-        instead: what else a user can do, for the message.
+        instead: Alternative for the user, appended to the message.
 
     Raises:
-        InputError: a package is missing.
+        InputError: A package is missing.
     """
     if not all(map(importlib.util.find_spec, NEEDED)):
         raise InputError(f'films need PyAV and OpenCV: pip install -e ".[vision]"{instead}')
@@ -28,10 +28,10 @@ def require(instead: str = "") -> None:
 
 @cache
 def imported(name: str) -> Any:
-    """One of the packages.
+    """Import one of the packages for films.
 
     Raises:
-        InputError: it is missing.
+        InputError: The package is missing.
     """
     try:
         return importlib.import_module(name)

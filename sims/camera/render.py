@@ -1,10 +1,9 @@
-"""Films of a ball, rendered by Bullet's processor-only renderer (TinyRenderer), without a window.
+"""Render films of a ball with PyBullet's CPU renderer (TinyRenderer), without a window.
 
-What does not move is rendered once. Of each frame only a window around the ball is rendered,
-several times finer than the picture and then averaged, so that edges are smooth as a lens makes
-them and a frame costs a fraction of what the whole picture would. Ground pattern, shadow and camera
-noise are laid over in numpy: the renderer has no procedural textures, and its shadow map darkens
-flat ground by itself.
+The static scene is rendered once. In each frame only a window around the ball is rendered, at two
+or three times the resolution and then averaged, so that edges are smooth as through a lens and a
+frame costs a fraction of a whole picture. Ground pattern, shadow and camera noise are added with
+NumPy: the renderer has no procedural textures, and its shadow map darkens flat ground by itself.
 """
 
 from __future__ import annotations
@@ -24,38 +23,38 @@ from sims.camera.look import Look
 from sims.camera.sphere import sphere
 
 Image: TypeAlias = NDArray[np.uint8]
-"""A picture (height, width, 3), red, green, blue."""
+"""Picture (height, width, 3): red, green, blue."""
 Colours: TypeAlias = NDArray[np.float32]
-"""The same while it is worked at, in grey levels; or each pixel's share (height, width, 1)."""
+"""Picture in floating-point grey levels; or each pixel's coverage (height, width, 1)."""
 Window: TypeAlias = tuple[int, int, int, int]
-"""A part of a picture: left, top, behind its right, below its bottom."""
+"""Part of a picture in pixels: left, top, right (exclusive), bottom (exclusive)."""
 
 _NEAR = 0.2
-"""m from the camera; what is closer is not drawn."""
+"""Distance from the camera below which nothing is drawn, m."""
 _FAR = 200.0
-"""m from the camera; what is further is not drawn."""
+"""Distance from the camera beyond which nothing is drawn, m."""
 _GROUND = 60.0
-"""m, half the side of the ground."""
+"""Half the side length of the ground, m."""
 _THICKNESS = 0.05
-"""m, half that of the ground, whose upper side is at height 0."""
+"""Half the thickness of the ground, whose upper side is at height 0, m."""
 _MARGIN = 2
-"""Pixels around the ball's outline that are rendered with it."""
+"""Number of pixels around the ball's outline that are rendered with it."""
 _SMALL = 20
-"""Pixels; a ball of a smaller radius is rendered three times finer, a larger one twice."""
+"""Radius in pixels below which a ball is rendered three times finer; larger ones twice."""
 _SHARPEST = 0.02
-"""Of the ball's radius: half the width of a shadow's edge where the ball lies on the ground."""
+"""Half the width of a shadow's edge where the ball is on the ground, in ball radii."""
 _SUN = 0.01
-"""rad; how much wider the edge gets with the way from ball to ground, as from the sun's disc."""
+"""Growth of the shadow's edge per distance from ball to ground, as from the sun's disc, rad."""
 
 
 class Stage:
-    """A scene, a ball and a camera, ready to film.
+    """Scene with ground, ball and camera, ready to be rendered.
 
     Args:
-        camera: where from.
-        look: colours, light, noise.
-        radius: of the ball, m.
-        rng: the camera's noise.
+        camera: Camera.
+        look: Colours, light and noise.
+        radius: Radius of the ball, m.
+        rng: Random number generator for the camera noise.
     """
 
     def __init__(self, camera: Camera, look: Look, radius: float, rng: np.random.Generator) -> None:
@@ -73,7 +72,7 @@ class Stage:
         everything = 0, 0, width, height
         self._rays = self._directions()
         picture, covered = self._render(everything, 1, ground)
-        # frames are rendered without it: it does not change
+        # Frames are rendered without the ground, because it does not change.
         p.removeBody(ground, physicsClientId=self._client)
         self._still = self._background(picture, covered)
         points, faces = sphere()
@@ -82,24 +81,24 @@ class Stage:
             look.ball,
             vertices=(radius * points).tolist(),
             indices=faces,
-            # of the sphere and not of its faces, so that shading is smooth
+            # Normals of the sphere instead of its faces, for smooth shading.
             normals=points.tolist(),
         )
 
     def film(self, positions: Iterable[Array]) -> Iterator[Image]:
-        """One frame for each position (3,) of the ball's centre, m."""
+        """Render one frame for each position (3,) of the ball's centre, m."""
         return (self.frame(np.asarray(position, dtype=np.float64)) for position in positions)
 
     def frame(self, position: Array) -> Image:
-        """The picture with the ball's centre at `position` (3,), m."""
+        """Render a frame with the ball's centre at `position` (3,), m."""
         picture = self._still.copy()
-        # the shadow first: the ball may hide a part of it
+        # The shadow comes first, because the ball may hide a part of it.
         self._cast_shadow(picture, position)
         self._draw_ball(picture, position)
         if self.look.noise > 0:
             grain = self._rng.standard_normal(picture.shape, dtype=np.float32)
             picture += self.look.noise * grain
-        # half a level, since the conversion to whole ones cuts off
+        # Add half a grey level, because the conversion to integers truncates.
         return (picture + 0.5).clip(0, 255).astype(np.uint8)
 
     def _place(self, body: int, position: ArrayLike) -> None:
@@ -115,15 +114,15 @@ class Stage:
             physicsClientId=self._client,
             **size,
         )
-        # no mass and no collision shape: nothing is simulated here
+        # No mass and no collision shape, because nothing is simulated here.
         body: int = p.createMultiBody(0.0, -1, visual, physicsClientId=self._client)
         return body
 
     def _directions(self) -> Array:
-        """For each pixel the world vector (height, width, 3) along which the camera looks."""
+        """Return the viewing direction of each pixel as world vectors (height, width, 3)."""
         v, u = np.mgrid[: self.camera.size[1], : self.camera.size[0]]
         right, down, forward = self.camera.axes
-        # (2) of sims.camera.camera, for depth 1 and turned round
+        # Equation (2) of sims.camera.camera at depth 1, inverted
         middle_u, middle_v = self.camera.middle
         a = (u - middle_u) / self.camera.focal
         b = (v - middle_v) / self.camera.focal
@@ -131,14 +130,17 @@ class Stage:
         return result
 
     def _background(self, picture: Colours, covered: Colours) -> Colours:
-        """The scene without the ball, from the rendered ground and its share of each pixel.
+        """Return the scene without the ball, and store the visible ground points for shadows.
 
-        Keeps for shadows where the ground is that each pixel shows, and whether it shows any.
+        Args:
+            picture: Rendered ground.
+            covered: Fraction of each pixel that the ground covers.
         """
-        # a ray meets the ground where its height is 0
+        # A ray meets the ground at height 0.
         with np.errstate(divide="ignore"):
             far = -self.camera.position[2] / self._rays[..., 2]
-        # without the second, what is above the horizon would meet it behind the camera
+        # Without the second condition, rays above the horizon would meet the ground behind the
+        # camera.
         meets = (covered[..., 0] > 0.5) & (far > 0)
         along = np.where(meets, far, 0.0)
         points = self.camera.position + along[..., None] * self._rays
@@ -150,13 +152,11 @@ class Stage:
         return np.where(meets[..., None], ground, sky).astype(np.float32)
 
     def _cast_shadow(self, picture: Colours, position: Array) -> None:
-        """Darken the ground from which the ball hides the light; its edge is as soft as the sun's
-        disc is wide.
-        """
+        """Darken the ground in the ball's shadow; the sun's disc softens its edge."""
         light = self.look.light
         stretch = 1 / light[2]
         travel = position[2] / light[2]
-        # where the line through the ball's centre along the light meets the ground
+        # Intersection of the ground with the line through the ball's centre along the light.
         foot = position - travel * light
         signs = np.array(
             [
@@ -166,7 +166,7 @@ class Stage:
                 (1, 1, 0.0),
             ]
         )
-        # a slanting light makes the disc an ellipse, longer by the stretch
+        # Slanting light stretches the disc to an ellipse.
         corners = foot + self.radius * stretch * 1.1 * signs
         window = _window(self.camera.project(corners), self.camera.size)
         if window is None:
@@ -174,7 +174,7 @@ class Stage:
         left, top, right, bottom = window
         place = np.s_[top:bottom, left:right]
         away = self._points[place] - foot.astype(np.float32)
-        # distance from that line, by Pythagoras; rounding may make it slightly imaginary
+        # Distance from that line by Pythagoras; rounding may make the square negative.
         along = away @ light.astype(np.float32)
         far = (away * away).sum(axis=-1)
         squares = far - along * along
@@ -186,7 +186,7 @@ class Stage:
         picture[place] *= left_over[..., None].astype(np.float32)
 
     def _draw_ball(self, picture: Colours, position: Array) -> None:
-        """Lay the ball over the picture, each pixel by the share that the ball has of it."""
+        """Blend the ball into the picture, weighted by its coverage of each pixel."""
         centre, (longer, _) = self.camera.outline(position, self.radius)
         reach = longer + _MARGIN
         if not np.isfinite(reach):
@@ -203,20 +203,28 @@ class Stage:
         picture[place] = covered * ball + (1 - covered) * picture[place]
 
     def _render(self, window: Window, fine: int, body: int) -> tuple[Colours, Colours]:
-        """A window (left, top, right, bottom) of the picture: colours of `body`, and its share of
-        each pixel.
+        """Render a body in a window of the picture.
+
+        Args:
+            window: Window (left, top, right, bottom).
+            fine: Factor of oversampling.
+            body: Id of the body.
+
+        Returns:
+            Mean colours of the body (height, width, 3), and its coverage (height, width, 1).
         """
         p = bullet.engine()
         camera = self.camera
         left, top, right, bottom = window
         width = right - left
         height = bottom - top
-        # metres on the near plane that a pixel shows
+        # size of a pixel on the near plane in metres
         at = _NEAR / camera.focal
-        # the renderer counts pixels from their corner: half a fine pixel, measured on spheres
+        # The renderer counts pixels from their corner: shift by half a fine pixel, measured on
+        # spheres.
         shift = 0.5 / fine
         u, v = camera.middle - (shift, -shift)
-        # edges of the window, half a pixel from the centres of its outermost ones
+        # The edges of the window are half a pixel outside the centres of its outermost pixels.
         left_edge = left - 0.5 - u
         right_edge = right - 0.5 - u
         lower_edge = bottom - 0.5 - v
@@ -240,7 +248,7 @@ class Stage:
             renderer=p.ER_TINY_RENDERER,
             physicsClientId=self._client,
         )
-        # fine pixels in groups that make one each; colours of the body alone are averaged
+        # Average the fine pixels of each pixel; only colours of the body itself count.
         grouped = height, fine, width, fine
         there = np.reshape(bodies, (*grouped, 1)) == body
         share = there.mean(axis=(1, 3), dtype=np.float32)
@@ -251,9 +259,7 @@ class Stage:
 
 
 def _window(pixels: Array, size: tuple[int, int]) -> Window | None:
-    """The part of the picture (left, top, right, bottom) that holds `pixels` (n, 2); None if they
-    lie outside.
-    """
+    """Return the window of the picture that contains `pixels` (n, 2); None if they are outside."""
     if not np.isfinite(pixels).all():
         return None
     left, top = (max(0, math.floor(x)) for x in pixels.min(axis=0))

@@ -1,4 +1,4 @@
-"""A finely divided sphere for the renderer, whose own is a polyhedron of 4 % less radius."""
+"""Fine mesh of a sphere for the renderer, whose own is a polyhedron of 4 % smaller radius."""
 
 from __future__ import annotations
 
@@ -10,18 +10,24 @@ import numpy as np
 from sims.base import Array, frozen
 
 _FACES = 3
-"""Divisions of each face of the icosahedron; its silhouette is then round to 0.3 %."""
+"""Number of subdivisions of the icosahedron's faces; the silhouette is then round to 0.3 %."""
 
 
 @functools.cache
 def sphere(divisions: int = _FACES) -> tuple[Array, tuple[int, ...]]:
-    """Points (n, 3) of a unit sphere, and its triangles as indices, three after three.
+    """Return a triangle mesh of the unit sphere.
 
-    Each face of an icosahedron is divided into four, again and again; with three divisions 642
-    points.
+    Each face of an icosahedron is divided into four, repeatedly; three divisions give 642 points.
+
+    Args:
+        divisions: Number of subdivisions.
+
+    Returns:
+        Points (n, 3), and the corners of the triangles as a flat list of indices, three per
+        triangle.
     """
     golden = (1 + 5**0.5) / 2
-    # the corners of three golden rectangles at right angles
+    # Corners of three golden rectangles at right angles.
     corners = [
         (-1, golden, 0),
         (1, golden, 0),
@@ -39,7 +45,7 @@ def sphere(divisions: int = _FACES) -> tuple[Array, tuple[int, ...]]:
 
 
 def _neighbours(points: list[Array]) -> list[tuple[int, int, int]]:
-    """Numbers of three corners that are a side apart, each triple once."""
+    """Return the index triples of corners that are one side length apart, each triple once."""
     side = min(float(np.linalg.norm(points[0] - p)) for p in points[1:])
 
     def near(i: int, j: int) -> bool:
@@ -53,7 +59,7 @@ def _neighbours(points: list[Array]) -> list[tuple[int, int, int]]:
 
 
 def _outward(points: list[Array], face: tuple[int, int, int]) -> tuple[int, int, int]:
-    """The face with its corners anticlockwise as seen from outside."""
+    """Return the face with its corners anticlockwise as seen from outside."""
     i, j, k = face
     a = points[i]
     normal = np.cross(points[j] - a, points[k] - a)
@@ -61,11 +67,11 @@ def _outward(points: list[Array], face: tuple[int, int, int]) -> tuple[int, int,
 
 
 def _divided(points: list[Array], faces: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
-    """Four faces for each; the new points are added to `points`."""
+    """Divide each face into four; the new points are appended to `points`."""
     numbers: dict[tuple[int, int], int] = {}
 
     def middle(i: int, j: int) -> int:
-        # two faces share an edge and so its middle
+        # Two faces share an edge and its midpoint.
         edge = min(i, j), max(i, j)
         if edge not in numbers:
             between = points[i] + points[j]
@@ -78,7 +84,7 @@ def _divided(points: list[Array], faces: list[tuple[int, int, int]]) -> list[tup
         ij = middle(i, j)
         jk = middle(j, k)
         ki = middle(k, i)
-        # the three at its corners, then the one in its middle, all turned the same way
+        # Three faces at the corners and one in the middle, all with the same orientation.
         result += [
             (i, ij, ki),
             (j, jk, ij),

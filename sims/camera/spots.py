@@ -1,10 +1,10 @@
-"""Round things that differ from the background in one picture, measured to a fraction of a pixel.
+"""Detect round objects that differ from the background, with subpixel accuracy.
 
-What differs is divided into connected spots. A circle is fitted to each spot's edge, found along
-rays from its middle where the difference has fallen to half of what it is inside: there half a
-pixel's area is the ball's, whatever its colour. Rays that meet something else (a shadow, the
-picture's edge, a patch of like colour) lie off the circle and are left out; a spot for which too
-few agree is no ball.
+Pixels that differ are grouped to connected regions. A circle is fitted to the edge of each region.
+The edge is located along rays from the centre where the difference has fallen to half of its value
+inside: there the ball covers half of a pixel, whatever its colour. Rays that meet other things (a
+shadow, the picture's edge, a patch of similar colour) are outliers of the circle and are ignored; a
+region in which too few rays agree is not a ball.
 """
 
 from __future__ import annotations
@@ -21,54 +21,60 @@ from sims.camera.packages import imported
 from sims.camera.render import Image
 
 _RAYS = 36
-"""Rays along which an edge is looked for, all around."""
+"""Number of rays, evenly spaced over the full circle, along which an edge is located."""
 _LEAST_AREA = 6
-"""Pixels of a spot; less is noise."""
+"""Minimum area of a region in pixels; smaller ones are noise."""
 _LEAST_LEVEL = 12.0
-"""Grey levels from the background, even where the camera has no noise: compression has."""
+"""Minimum threshold of the difference in grey levels, because compression adds noise."""
 _AGREE = 0.6
-"""Share of the rays that must agree on a circle."""
+"""Minimum fraction of the rays that must agree on a circle."""
 _GOOD = 0.85
-"""Where fewer agree with the first circle, one is begun on arcs: a shadow at the side bends it."""
+"""Fraction of agreeing rays below which a fit from arcs is also tried, as shadows bias circles."""
 _MOST_SPOTS = 4
-"""Spots of a picture that are measured, the largest."""
+"""Maximum number of regions per picture that are measured, the largest first."""
 _TINY = 2.5
-"""Pixels; a smaller radius has no room for rays."""
+"""Radius in pixels below which a region is too small for rays."""
 _ROUNDS = 3
-"""Rounds of edge and circle, each from the circle before."""
+"""Maximum number of iterations of edge location and circle fit."""
 _STILL = 0.02
-"""Pixels; a circle that moves by less has settled."""
+"""Change of a circle in pixels below which the iteration ends."""
 _FINE = 0.25
-"""Pixels from one sample along a ray to the next."""
+"""Spacing of samples along a ray, pixels."""
 _LOOSE = 0.5
-"""Pixels; width of the weights where the radius is known."""
+"""Width of the robust weights in pixels when the radius is known."""
 _RIM = 5
-"""Pixels; width of the line around a spot in which nothing passes for shadow."""
+"""Width in pixels of the line around a region in which nothing is treated as shadow."""
 _AROUND = 1.6
-"""Radii from the middle at which a spot's surroundings are looked at."""
+"""Distance from the centre at which a region's surroundings are sampled, in radii."""
 _SHADE = (0.25, 0.97)
-"""Factors on the background that are shadow; darker is a thing, lighter is noise."""
+"""Range of brightness factors of shadow; darker is an object, lighter is noise."""
 _UNEVEN = 6.0
-"""Grey levels by which colours may miss one factor and still be shadow."""
+"""Maximum deviation of the colours from a common factor for shadow, grey levels."""
 _OUTSIDE = -1000.0
-"""Stands for what is beyond the picture; far below every difference."""
+"""Value for pixels outside the picture, far below every difference."""
 _SINGULAR = 1e-6
-"""A determinant below this belongs to edges that do not fix a middle."""
+"""Determinant below which an edge does not determine a centre."""
 _TURNS = 12
-"""Steps of Gauss-Newton at most."""
+"""Maximum number of Gauss-Newton steps."""
 
 Values: TypeAlias = NDArray[np.float32]
-"""Grey levels, or places in pixels."""
+"""Grey levels, or positions in pixels."""
 Mask: TypeAlias = NDArray[np.bool_]
 
 
 class Spot(NamedTuple):
-    """A ball-like thing: middle and radius of its outline in pixels, the share of rays that agree,
-    their scatter.
+    """Detected ball.
 
-    `edges` (n, 2) are the points of its edge to which the circle was fitted; none for a ball of a
-    few pixels. `colour` is that of its middle, `contrast` how far that is from the background
-    there, in grey levels. A `ghost` is a ball or shadow in the background that the picture lacks.
+    Attributes:
+        u: Horizontal position of the centre, pixels.
+        v: Vertical position of the centre, pixels.
+        radius: Radius of the outline, pixels.
+        agree: Fraction of the rays that agree on the circle.
+        scatter: RMS distance of the agreeing edge points from the circle, pixels.
+        edges: Edge points (n, 2) to which the circle was fitted; none for a ball of a few pixels.
+        colour: Mean colour at the centre, grey levels.
+        contrast: Difference of that colour from the background, grey levels.
+        ghost: Whether it is a ball or shadow in the background image that the picture lacks.
     """
 
     u: float
@@ -82,9 +88,9 @@ class Spot(NamedTuple):
     ghost: bool = False
 
     def with_radius(self, radius: float) -> Spot:
-        """The same, its middle fitted again to the edge with the radius known from other pictures.
+        """Return the detection with its centre refitted for a radius known from other pictures.
 
-        Where shade hides a part of the edge, the middle and a free radius give way together.
+        If shade hides a part of the edge, a fit with free radius shifts both centre and radius.
         """
         if len(self.edges) < 0.4 * _RAYS:
             return self
@@ -94,9 +100,9 @@ class Spot(NamedTuple):
             away_v = self.edges[:, 1] - v
             far = np.maximum(np.hypot(away_u, away_v), 1e-9)
             rest = far - radius
-            # Geman and McClure's weights: what is not on the circle hardly counts
+            # Geman-McClure weights: points off the circle hardly count.
             weights = 1 / (1 + (rest / _LOOSE) ** 2) ** 2
-            # (2) of sims.camera.circle without dR
+            # Equation (2) of sims.camera.circle without dR
             rows = np.stack([away_u / far, away_v / far, rest])
             normal = (rows * weights) @ rows.T
             (a, b, p), (_, c, q), _ = normal.tolist()
@@ -110,27 +116,27 @@ class Spot(NamedTuple):
             v += dv
             if abs(du) + abs(dv) < 1e-3:
                 break
-        # it has run to something else's edge
+        # The fit has moved to the edge of another object.
         if np.hypot(u - self.u, v - self.v) > 0.5 * radius:
             return self
         return self._replace(u=u, v=v)
 
 
 class Finder:
-    """Finds spots in pictures of one scene.
+    """Detector of round objects in pictures of one scene.
 
     Args:
-        background: the scene without the ball.
-        sigma: noise, 1 sigma in grey levels.
-        shadows: whether what is merely darker than the background is taken for shadow; wrong for a
-            ball of the ground's own hue.
+        background: Scene without the ball.
+        sigma: Standard deviation of the noise, grey levels.
+        shadows: Whether regions that are only darker than the background are treated as shadow;
+            wrong for a ball of the ground's own hue.
     """
 
     def __init__(self, background: Image, sigma: float, shadows: bool) -> None:
         self.background = background
         self.sigma = sigma
         self.shadows = shadows
-        # six sigma: of ten thousand pixels none passes by noise alone
+        # With six sigma, none of ten thousand pixels exceeds the threshold by noise alone.
         self.level = max(_LEAST_LEVEL, 6 * sigma)
         self._plain = background.astype(np.float32)
         cv2 = imported("cv2")
@@ -139,7 +145,12 @@ class Finder:
         self._square = np.maximum(squares, 1.0)
 
     def spots(self, picture: Image, ghosts: bool = False) -> list[Spot]:
-        """What looks like a ball, the largest first; with the ghosts, if asked for."""
+        """Detect round objects in a picture, the largest first.
+
+        Args:
+            picture: Picture (height, width, 3).
+            ghosts: Whether to include objects that only the background image has.
+        """
         cv2 = imported("cv2")
         difference = self._difference(picture)
         grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
@@ -150,7 +161,7 @@ class Finder:
         if self.shadows:
             shade = self._even(picture, mask) > 0
             mask[shade] = 0
-            # single pixels that shadow and noise leave
+            # Remove single pixels that remain from shadow and noise.
             pair = np.ones((2, 2), np.uint8)
             mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, pair)
         else:
@@ -166,9 +177,7 @@ class Finder:
         return seen if ghosts else [spot for spot in seen if not spot.ghost]
 
     def _coloured(self, spot: Spot, picture: Image) -> Spot:
-        """The spot with the colour of its middle, and whether it is the background that stands out
-        against the rest.
-        """
+        """Add to a detection its colour, its contrast, and whether it is a background artefact."""
         here = _inside(picture, spot)
         behind = _inside(self.background, spot)
         out = _around(picture, spot)
@@ -178,18 +187,18 @@ class Finder:
         return spot._replace(colour=tuple(here.tolist()), contrast=contrast, ghost=ghost)
 
     def unshaded(self, picture: Image) -> Mask:
-        """Where the picture lacks a shadow that the background has."""
+        """Return the mask where the picture lacks a shadow of the background image."""
         cv2 = imported("cv2")
         mask = (self._difference(picture) > self.level).astype(np.uint8)
         lighter = (self._even(picture, mask) > 1).astype(np.uint8)
         count, parts, sizes, _ = cv2.connectedComponentsWithStats(lighter)
         gone = np.zeros(mask.shape, bool)
-        # part 0 is what lies between the others
+        # Component 0 is the area between the others.
         for part in range(1, count):
             if sizes[part, cv2.CC_STAT_AREA] < _LEAST_AREA:
                 continue
             inside = (parts == part).astype(np.uint8)
-            # a pixel is left out between inside and ring, half one and half the other
+            # Leave out one pixel between inside and ring, which is half one and half the other.
             near = cv2.dilate(inside, np.ones((3, 3), np.uint8))
             wide = cv2.dilate(near, np.ones((5, 5), np.uint8))
             ring = (wide > 0) & (near == 0) & (mask == 0)
@@ -198,21 +207,24 @@ class Finder:
             within = inside > 0
             shown = _medians(picture, within, ring)
             hidden = _medians(self.background, within, ring)
-            # a pale ball is lighter too, but it stands out in the picture
+            # A pale ball is lighter, too, but it stands out in the picture.
             if self._is_ghost(shown, hidden):
                 gone |= within
         return gone
 
     def _is_ghost(self, here: tuple[Array, Array], behind: tuple[Array, Array]) -> bool:
-        """Whether a thing is in the background and not in the picture: colours (inside, around) of
-        both.
+        """Return whether an object is in the background image and not in the picture.
+
+        Args:
+            here: Colours inside and around the object in the picture.
+            behind: Colours there in the background image.
         """
         stands_out = float(np.abs(here[0] - here[1]).max())
         stood_out = float(np.abs(behind[0] - behind[1]).max())
         return stood_out > stands_out + self.level / 2
 
     def _difference(self, picture: Image) -> NDArray[np.uint8]:
-        """The largest difference over the colours."""
+        """Return the largest difference from the background over the colours (height, width)."""
         cv2 = imported("cv2")
         apart = cv2.absdiff(picture, self.background)
         red_green = cv2.max(apart[..., 0], apart[..., 1])
@@ -220,21 +232,20 @@ class Finder:
         return result
 
     def _even(self, picture: Image, mask: NDArray[np.uint8]) -> Values:
-        """The factor by which the picture is the background where that is one in all colours, else
-        0.
+        """Return the factor between picture and background where it is the same in all colours.
 
-        Below 1 it is shadow, above 1 shadow gone.
+        The factor is below 1 in shadow, above 1 where the picture lacks a shadow, and 0 elsewhere.
         """
         result = np.zeros(mask.shape, np.float32)
         rows, columns = np.nonzero(mask)
         there = picture[rows, columns].astype(np.float32)
         plain = self._plain[rows, columns]
-        # least squares over the three colours
+        # Least squares over the three colours.
         product = (there * plain).sum(axis=1)
         factor = product / self._square[rows, columns]
         apart = np.abs(there - factor[:, None] * plain).max(axis=1)
         rest = apart / np.maximum(factor, 1)
-        # shadow gone is judged as shadow is, by the inverse
+        # A missing shadow is judged by the inverse factor.
         even = np.minimum(factor, 1 / np.maximum(factor, 1e-3))
         darkest, lightest = _SHADE
         shade = (even > darkest) & (even < lightest)
@@ -248,10 +259,16 @@ class Finder:
         differences: tuple[NDArray[np.uint8], ...],
         shade: Mask,
     ) -> Spot | None:
-        """What a contour holds, measured in `differences` of brightness and of the worst colour."""
+        """Measure the object inside a contour; None if it is not round.
+
+        Args:
+            contour: Contour of the region.
+            differences: Differences of brightness and of the worst colour (height, width).
+            shade: Mask of the shadow (height, width).
+        """
         cv2 = imported("cv2")
         left, top, width, height = cv2.boundingRect(contour)
-        # what nearly fills the picture is no ball before a background
+        # An object that nearly fills the picture is not a ball in front of a background.
         if width * height < _LEAST_AREA or max(width, height) > 0.9 * min(shade.shape):
             return None
         filled = np.zeros((height + 2, width + 2), np.uint8)
@@ -259,19 +276,19 @@ class Finder:
         cv2.drawContours(filled, [contour], -1, 1, -1, offset=offset)
         if int(filled.sum()) < _LEAST_AREA:
             return None
-        # the largest disc inside is the ball even where a shadow hangs on to it
+        # The largest inscribed disc is the ball, even if a shadow is connected to it.
         inside = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
         row, column = np.unravel_index(int(inside.argmax()), inside.shape)
         radius = max(float(inside[row, column]), 1.0)
         u = left + float(column) - 1
         v = top + float(row) - 1
-        # a window around it, where shadow counts as background unless the spot encloses it
+        # Use a window around it in which shadow counts as background unless the region encloses it.
         reach = int(2 * max(radius, 0.5 * max(width, height))) + 4
         u0 = max(0, int(u) - reach)
         v0 = max(0, int(v) - reach)
         place = np.s_[v0 : int(v) + reach + 1, u0 : int(u) + reach + 1]
         windows = np.stack([each[place] for each in differences]).astype(np.float32)
-        # the edge itself, half ball and half background, may pass for shadow
+        # The edge itself, half ball and half background, must not be treated as shadow.
         hidden = shade[place].astype(np.uint8)
         offset = -u0, -v0
         cv2.drawContours(hidden, [contour], -1, 0, -1, offset=offset)
@@ -288,7 +305,7 @@ class Finder:
         u0: int,
         v0: int,
     ) -> Spot | None:
-        """The spot's circle in windows that begin at (u0, v0); None where too few rays agree."""
+        """Fit a circle in windows that begin at (u0, v0); None if too few rays agree."""
         u, v, radius = start
         on_it = np.empty(0, bool)
         rest = np.empty(0)
@@ -313,7 +330,7 @@ class Finder:
                 break
         agree = float(on_it.sum()) / _RAYS
         height, width = windows.shape[1:]
-        # a middle outside the window belongs to an arc of something large
+        # A centre outside the window belongs to an arc of a large object.
         within = -0.5 <= u <= width - 0.5
         within &= -0.5 <= v <= height - 0.5
         if edges is None or agree < _AGREE or not within:
@@ -323,11 +340,20 @@ class Finder:
         return Spot(u + u0, v + v0, radius, agree, scatter, whole)
 
     def _edges(self, windows: Values, u: float, v: float, radius: float) -> Array | None:
-        """Points (n, 2) where the difference has fallen to half along rays from (u, v); None for
-        too few.
+        """Locate the points (n, 2) where the difference falls to half along rays from (u, v).
 
-        What it falls from is taken just inside the edge, since a lit ball is not the same all over.
-        Brightness counts where it differs enough: video files keep colours at half the resolution.
+        The reference value is taken just inside the edge, because the brightness of a lit ball
+        varies. Brightness is used where it differs enough: video files store colours at half the
+        resolution.
+
+        Args:
+            windows: Differences of brightness and of the worst colour (2, height, width).
+            u: Horizontal position of the centre in the window, pixels.
+            v: Vertical position of the centre in the window, pixels.
+            radius: Approximate radius, pixels.
+
+        Returns:
+            Edge points in the window; None if there are too few.
         """
         begin = max(0.0, 0.7 * radius - 2)
         steps = np.arange(begin, 1.5 * radius + 2, _FINE, dtype=np.float32)
@@ -335,7 +361,7 @@ class Finder:
         along_u = (u + cos * steps).astype(np.float32)
         along_v = (v + sin * steps).astype(np.float32)
         profiles = [_along(window, along_u, along_v) for window in windows]
-        # the last pixels before the edge, without those that blur has reached
+        # Last pixels inside the edge, except those affected by blur.
         inner = steps > min(0.5 * radius, radius - 3.5)
         inner &= steps < max(0.7 * radius, radius - 1.3)
         half_way = int(inner.sum()) // 2
@@ -351,19 +377,19 @@ class Finder:
         crossed = half[:, None]
         below = values[:, 1:] < crossed
         below &= values[:, :-1] >= crossed
-        # a dark patch further inside is no edge
+        # A dark patch further inside is not an edge.
         below[:, : int(np.flatnonzero(inner)[0])] = False
-        # of several crossings the first
+        # Take the first of several crossings.
         k = below.argmax(axis=1)
         lines = np.arange(_RAYS)
         a = values[lines, k]
         b = values[lines, k + 1]
         has = below.any(axis=1) & (half > 0.4 * self.level)
-        # where it falls to what is outside, the picture ends and not the ball
+        # A fall to the value for outside is the end of the picture, not of the ball.
         has &= b > 0.5 * _OUTSIDE
         if has.sum() < 0.5 * _RAYS:
             return None
-        # between the two samples, in proportion
+        # Interpolate linearly between the two samples.
         drop = np.maximum(a - b, 1e-6)
         share = (a - half)[has] / drop[has]
         out = steps[k[has]] + _FINE * share
@@ -380,7 +406,7 @@ class Finder:
         u0: int,
         v0: int,
     ) -> Spot | None:
-        """A ball of a few pixels: the middle of the difference, and a circle of its sum."""
+        """Measure a ball of a few pixels: centroid of the difference, and radius from its sum."""
         height, width = window.shape
         rows, columns = np.mgrid[:height, :width]
         near = np.hypot(columns - u, rows - v) <= radius + 2.5
@@ -389,26 +415,26 @@ class Finder:
         peak = float(np.percentile(window[near], 90))
         if total <= 0 or peak < self.level:
             return None
-        # a pixel that the ball covers in part differs in part: sums measure areas
+        # A partly covered pixel differs in proportion: sums measure areas.
         area = total / max(peak, 1.0)
         if area < _LEAST_AREA / 2:
             return None
         u = u0 + float((weights * columns).sum() / total)
         v = v0 + float((weights * rows).sum() / total)
         equal = float(np.sqrt(area / np.pi))
-        # no rays, so no share of them: as good as the worst circle
+        # Without rays there is no agreement; assume that of the worst accepted circle.
         return Spot(u, v, equal, _AGREE, 0.2)
 
 
 def _medians(picture: Image, inside: Mask, around: Mask) -> tuple[Array, Array]:
-    """Median colours (3,) of two parts of a picture."""
+    """Return the median colours (3,) of two parts of a picture."""
     within: Array = np.median(picture[inside], axis=0)
     outside: Array = np.median(picture[around], axis=0)
     return within, outside
 
 
 def _inside(picture: Image, spot: Spot) -> Array:
-    """Mean colour (3,) of a spot's middle."""
+    """Return the mean colour (3,) at a detection's centre."""
     side = 2 * max(1, int(0.4 * spot.radius)) + 1
     patch = imported("cv2").getRectSubPix(picture, (side, side), (spot.u, spot.v))
     colour: Array = patch.reshape(-1, 3).mean(axis=0)
@@ -416,14 +442,14 @@ def _inside(picture: Image, spot: Spot) -> Array:
 
 
 def _around(picture: Image, spot: Spot) -> Array:
-    """Median colour (3,) around a spot."""
+    """Return the median colour (3,) around a detection."""
     cos, sin = _directions()
     height, width = picture.shape[:2]
     away = _AROUND * spot.radius
     half = _RAYS // 2
     rows = (spot.v + away * sin[:, 0] + 0.5).astype(np.intp)
     columns = (spot.u + away * cos[:, 0] + 0.5).astype(np.intp)
-    # at the picture's border its last pixels stand for what is beyond
+    # Beyond the border, the outermost pixels are repeated.
     rows = rows.clip(0, height - 1)
     columns = columns.clip(0, width - 1)
     ranked = np.partition(picture[rows, columns], half, axis=0)
@@ -432,7 +458,7 @@ def _around(picture: Image, spot: Spot) -> Array:
 
 
 def _along(window: Values, u: Values, v: Values) -> Values:
-    """Values of a window at places between its pixels; far below zero outside."""
+    """Interpolate a window at subpixel positions; `_OUTSIDE` outside it."""
     cv2 = imported("cv2")
     result: Values = cv2.remap(
         window,
@@ -447,6 +473,6 @@ def _along(window: Values, u: Values, v: Values) -> Values:
 
 @lru_cache(maxsize=1)
 def _directions() -> tuple[Array, Array]:
-    """Cosines and sines (rays, 1) of the rays."""
+    """Return the cosines and sines (rays, 1) of the ray directions."""
     angles = np.linspace(0, 2 * np.pi, _RAYS, endpoint=False)[:, None]
     return np.cos(angles), np.sin(angles)

@@ -1,4 +1,4 @@
-"""Tracking: where in each frame of a film the ball is, and nowhere where it is not to be seen."""
+"""Track the ball through the frames of a film."""
 
 from __future__ import annotations
 
@@ -17,39 +17,40 @@ from sims.camera.render import Image
 from sims.camera.spots import Finder, Spot
 
 _LEAST_FRAMES = 5
-"""Frames that must show the ball."""
+"""Minimum number of frames that must show the ball."""
 _WINDOW = 9
-"""Samples in a row from which noise is told, and below which no path is steadied."""
+"""Length in samples of the windows for noise estimation; shorter paths are not smoothed."""
 _FEW = 8
-"""Pictures on which both treatments of shadow are tried."""
+"""Approximate number of frames on which both treatments of shadows are compared."""
 _HELD = 200_000_000
-"""Bytes of frames that are kept in memory."""
+"""Maximum number of bytes of frames that are cached in memory."""
 _FEWEST = 3
-"""Pictures that must lack a thing before the background is said to have it."""
+"""Minimum number of frames without an object that prove that it is in the background estimate."""
 _MISFIT = 0.2
-"""Share by which a radius may miss the line of its path."""
+"""Maximum relative deviation of a radius from the linear trend along its path."""
 _SHADOWS = 0.8
-"""Share of the agreement without shadows' treatment that suffices to treat them."""
+"""Minimum ratio of the ray agreement with and without shadow removal at which it is used."""
 _ROUNDS = 10
-"""Rounds of reweighed least squares."""
+"""Number of iterations of reweighted least squares."""
 _SURE = 0.02
-"""Pixels; radii are not known better."""
+"""Lower limit of the uncertainty of a radius, in pixels."""
 
 
 @dataclass(frozen=True)
 class Track:
-    """A tracked ball.
+    """Tracked ball.
 
     Attributes:
-        times: (n,) seconds of the frames, of one shot.
-        u: (n,) pixels to the right of the upper left pixel's centre; NaN in frames without a ball.
-        v: (n,) pixels down.
-        radius: (n,) pixels, of the ball's outline.
-        noise: 1 sigma of u and v in pixels, from the path itself.
-        size: width and height of the picture.
-        notes: what a user should know, in sentences.
-        background: the scene without the ball.
-        pictures: a few frames of it, by number.
+        times: (n,) times of the frames of one shot, s.
+        u: (n,) horizontal position relative to the upper left pixel's centre, pixels; NaN in frames
+            without a ball.
+        v: (n,) position downwards, pixels.
+        radius: (n,) radius of the ball's outline, pixels.
+        noise: Standard deviation of u and v in pixels, estimated from the path.
+        size: Width and height of the picture, pixels.
+        notes: Remarks for the user, in sentences.
+        background: Scene without the ball.
+        pictures: Some of the frames, by number.
     """
 
     times: Array
@@ -69,13 +70,13 @@ class Track:
 
 
 def track(frames: Iterable[tuple[float, Image]]) -> Track:
-    """Track the ball that moves before a camera that does not.
+    """Track the ball that moves in front of a fixed camera.
 
     Args:
-        frames: time in seconds and picture (height, width, 3) of each frame; iterated three times.
+        frames: Time in seconds and picture (height, width, 3) of each frame; iterated three times.
 
     Raises:
-        InputError: there is no ball to be seen.
+        InputError: No ball is found.
     """
     frames = _Kept(frames)
     survey = background.survey(frames)
@@ -93,7 +94,7 @@ def track(frames: Iterable[tuple[float, Image]]) -> Track:
     if not paths:
         raise InputError(_nothing(end - first, sum(map(bool, spots))))
     path, others = joined(paths)
-    # what hardly moves may be a ball, but not one whose fall can be measured
+    # An object that hardly moves may be a ball, but its fall cannot be measured.
     if len(path.frames) < _LEAST_FRAMES or path.travel < path.radius:
         raise InputError(_nothing(end - first, len(path.frames)))
     _others(path, others, notes)
@@ -102,9 +103,7 @@ def track(frames: Iterable[tuple[float, Image]]) -> Track:
 
 
 class _Kept:
-    """Frames that are read once where they are few and small, and from their source each time where
-    not.
-    """
+    """Frames that are cached if they are few and small, and otherwise read again each time."""
 
     def __init__(self, source: Iterable[tuple[float, Image]]) -> None:
         self._source = source
@@ -121,7 +120,7 @@ class _Kept:
             if held <= _HELD:
                 frames.append((time, picture))
             else:
-                # too many: what is held so far goes at once
+                # Too many frames: release those cached so far at once.
                 frames.clear()
             yield time, picture
         if held <= _HELD:
@@ -129,7 +128,12 @@ class _Kept:
 
 
 def _nothing(frames: int, some: int) -> str:
-    """The message that there is no ball, though something round is in `some` of the frames."""
+    """Format the message that no ball was found.
+
+    Args:
+        frames: Number of frames.
+        some: Number of frames with a round object.
+    """
     seen = f"something round in {some} of {frames} frames, but nothing" if some else "nothing"
     return (
         f"no ball found: {seen} that moves and stays round; "
@@ -138,7 +142,7 @@ def _nothing(frames: int, some: int) -> str:
 
 
 def _shot(survey: background.Survey, notes: list[str]) -> tuple[int, int]:
-    """First and behind the last frame of the longest part without a cut."""
+    """Return the first frame and the end (exclusive) of the longest part without a cut."""
     shots = survey.shots()
     first, end = max(shots, key=lambda shot: shot[1] - shot[0])
     if len(shots) > 1:
@@ -156,19 +160,17 @@ def _shot(survey: background.Survey, notes: list[str]) -> tuple[int, int]:
 
 
 def _finder(pictures: list[Image]) -> Finder:
-    """A finder with the better treatment of shadows, and a background that the ball has been taken
-    out of.
-    """
+    """Make a detector with the better treatment of shadows and a background without the ball."""
     plain = background.median(pictures)
     every = max(1, len(pictures) // _FEW)
-    # twice: what the first background hides is seen against the second
+    # Two passes: objects hidden by the first background are detected with the second.
     for _ in range(2):
         sigma = background.noise(pictures, plain)
         careful = Finder(plain, sigma, shadows=True)
         careless = Finder(plain, sigma, shadows=False)
         by_careful = [careful.spots(p, ghosts=True) for p in pictures[::every]]
         by_careless = [careless.spots(p, ghosts=True) for p in pictures[::every]]
-        # a ball of the ground's own hue is itself taken for shadow; then shadow must be borne
+        # A ball of the ground's hue would be removed as shadow; then shadows must be tolerated.
         if _roundness(by_careful) >= _SHADOWS * _roundness(by_careless):
             best, known = careful, by_careful
         else:
@@ -188,17 +190,17 @@ def _finder(pictures: list[Image]) -> Finder:
 
 
 def _roundness(pictures: list[list[Spot]]) -> float:
-    """Share of rays that agree on each picture's best circle, added up."""
+    """Return the sum over frames of the best circle's fraction of agreeing rays."""
     return sum(
         max((spot.agree for spot in spots if not spot.ghost), default=0.0) for spots in pictures
     )
 
 
 def _hiding(found: list[list[Spot]]) -> list[list[Circle]]:
-    """Where something hides the background in each picture.
+    """Return the circles that hide the background in each picture.
 
-    A ball that rests for most of the film, or its shadow, gets into the median. Pictures that lack
-    it there show the background, and the others do not.
+    A ball that rests for most of the film, or its shadow, is part of the median. Pictures without
+    it at that position show the true background; in the others it hides the background.
     """
     balls: list[list[Circle]] = []
     ghosts: list[list[Circle]] = []
@@ -207,7 +209,7 @@ def _hiding(found: list[list[Spot]]) -> list[list[Circle]]:
         ghosts.append([(s.u, s.v, s.radius) for s in spots if s.ghost])
     for one in [ghost for there in ghosts for ghost in there]:
         lacking = [any(_same(one, other) for other in there) for there in ghosts]
-        # one or two pictures may lack it by mistake
+        # One or two frames may miss it by mistake.
         if sum(lacking) < _FEWEST:
             continue
         for there, lacks in zip(balls, lacking, strict=True):
@@ -217,8 +219,10 @@ def _hiding(found: list[list[Spot]]) -> list[list[Circle]]:
 
 
 def _shaded(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """Where a shadow hides the background in each picture (n, height, width), seen by those in
-    which it is gone.
+    """Return where a shadow hides the background in each picture (n, height, width).
+
+    Args:
+        lit: Masks (height, width) where the shadow in the background is missing, one per picture.
     """
     stack = np.stack(lit)
     result: NDArray[np.bool_] = ~stack & (stack.sum(axis=0) >= _FEWEST)
@@ -226,17 +230,17 @@ def _shaded(lit: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:
 
 
 def _same(a: Circle, b: Circle) -> bool:
-    """Whether two circles are of one thing that stays where it is."""
+    """Return whether two circles are the same object at rest."""
     apart = abs(a[0] - b[0]) + abs(a[1] - b[1])
     return apart < 0.3 * b[2] + 0.5 and 0.7 < a[2] / b[2] < 1.4
 
 
 def _others(path: Path, others: Sequence[Path], notes: list[str]) -> None:
-    """Note that something else moved beside the ball."""
+    """Add a note if a second object moves at the same time as the ball."""
     frames = set(path.frames)
     for other in others:
         shared = len(frames & set(other.frames))
-        # in passing, small or at rest it is no second ball
+        # A brief, small or resting object is not a second ball.
         beside = shared >= max(8, 0.25 * len(path.frames))
         moves = other.travel > 2 * other.radius
         if beside and moves and 0.4 < other.radius / path.radius < 2.5:
@@ -255,11 +259,20 @@ def _measured(
     finder: Finder,
     pictures: dict[int, Image],
 ) -> Track:
-    """The track of a path, with noise and notes; `pictures` are a few of the frames."""
+    """Make the track of a path, with noise estimate and notes.
+
+    Args:
+        times: (n,) times of the frames, s.
+        path: Path of the ball.
+        size: Width and height of the picture, pixels.
+        notes: Remarks so far.
+        finder: Detector, which has the background.
+        pictures: Some of the frames, by number.
+    """
     columns = np.full((3, len(times)), np.nan)
     steady, misfits = _steadied(path.spots)
     for frame, spot, misfit in zip(path.frames, steady, misfits, strict=True):
-        # an empty cell is better than something else's place
+        # An empty cell is better than the position of another object.
         if not misfit:
             columns[:, frame] = spot.u, spot.v, spot.radius
     u, v, radius = columns
@@ -272,7 +285,7 @@ def _measured(
     noise = np.nan
     if len(times) > _WINDOW:
         noise = max(rough(u), rough(v))
-    # too short or all at rest: how far edges lie off their circles is the next best
+    # If the path is too short or at rest, use the distance of the edges from their circles.
     if not (np.isfinite(noise) and noise > 0):
         noise = float(np.median([spot.scatter for spot in path.spots]))
     return Track(
@@ -289,18 +302,21 @@ def _measured(
 
 
 def _steadied(spots: list[Spot]) -> tuple[list[Spot], list[bool]]:
-    """Middles fitted again with radii that change evenly along the path, as perspective has it on a
-    straight line.
+    """Refit the centres with radii that change linearly along the path, as perspective implies.
 
-    The second list says whose own radius is too far from that: something else than the ball was
-    measured there.
+    Args:
+        spots: Detections of the ball.
+
+    Returns:
+        The refitted detections, and whether the radius of each deviates too much from the linear
+        trend, which means that another object was measured.
     """
     if len(spots) < _WINDOW:
         return spots, [False] * len(spots)
     places = np.array([(spot.u, spot.v) for spot in spots])
     offsets = places - places.mean(axis=0)
     spread = np.maximum(np.ptp(places, axis=0), 1.0)
-    # how far along the path's own direction, about -1 to 1
+    # position along the path's main direction, about -1 to 1
     axes = np.linalg.svd(offsets, full_matrices=False)[2]
     along = offsets @ axes[0] / spread.max()
     basis = np.stack([np.ones_like(along), along], axis=1)
@@ -311,7 +327,7 @@ def _steadied(spots: list[Spot]) -> tuple[list[Spot], list[bool]]:
         weighed = basis * weights[:, None]
         line = np.linalg.lstsq(weighed, radius * weights, rcond=None)[0]
         rest = np.abs(radius - basis @ line)
-        # heavy tails: what was measured at something else must not bend the line
+        # Weights with heavy tails: measurements of other objects must not affect the trend.
         width = max(float(np.median(rest)), _SURE)
         weights = 1 / (1 + (rest / width) ** 2)
     fitted = np.maximum(basis @ line, 0.5)
@@ -322,22 +338,28 @@ def _steadied(spots: list[Spot]) -> tuple[list[Spot], list[bool]]:
 
 
 def rough(values: Array) -> float:
-    """1 sigma of what a cubic through nine samples in a row leaves, where they move; NaN if they
-    never do.
+    """Estimate the noise of a signal from the residuals of local cubic fits.
 
-    Windows with a gap are passed over, those with a bounce do not weigh much: the median counts.
+    A cubic is fitted to each window of nine samples in which the signal moves. Windows with gaps
+    are skipped, and the median makes the result insensitive to bounces.
+
+    Args:
+        values: (T,) signal, NaN where missing.
+
+    Returns:
+        Standard deviation of the noise; NaN if the signal never moves.
     """
     if len(values) < _WINDOW:
         return float("nan")
     windows = sliding_window_view(values, _WINDOW)
     windows = windows[np.isfinite(windows).all(axis=1)]
-    # at rest the same pixels give the same error again and again, which is no scatter
+    # At rest the same pixels give the same error again and again, which is no scatter.
     there = values[np.isfinite(values)]
     travel = max(float(np.ptp(there)), 1e-12)
     windows = windows[np.ptp(windows, axis=1) > 1e-3 * travel * _WINDOW]
     if not len(windows):
         return float("nan")
-    # what is left by a cubic, of four numbers, has four degrees of freedom less
+    # A cubic has four coefficients, which reduces the degrees of freedom by four.
     cubic = np.vander(np.linspace(-1, 1, _WINDOW), 4)
     basis = np.linalg.qr(cubic)[0]
     rest = windows - windows @ basis @ basis.T

@@ -1,7 +1,7 @@
-"""Ordinary video files, written and read with their true time stamps.
+"""Read and write video files with their true time stamps.
 
-PyAV brings its own codecs and gives every frame's time as the file states it, also where frames
-come unevenly.
+PyAV contains its own codecs and reports each frame's time as stated in the file, also for uneven
+frame rates.
 """
 
 from __future__ import annotations
@@ -20,15 +20,13 @@ from sims.files import replacing, require_file
 from sims.recording.write import publish, refuse_existing
 
 _FRAMES = (1e-3, 1e7)
-"""Frames a second that a film of a drop can have."""
+"""Range of plausible frame rates, frames per second."""
 _TICKS = 90_000
-"""Time stamps a second in files written here; common for video, and a whole number for the usual
-rates.
-"""
+"""Time stamps per second in the files written here, a multiple of the usual frame rates."""
 _DEFAULT_RATE = 30.0
-"""Frames a second of a file that states neither times nor a rate."""
+"""Frame rate in frames per second of a file that states neither times nor a rate."""
 _HEAD = 64
-"""Bytes from which is told what a file is that no reader knows."""
+"""Number of bytes from which the kind of an unreadable file is determined."""
 
 
 def write_video(
@@ -38,27 +36,28 @@ def write_video(
     crf: int = 18,
     beside: Mapping[Path, str] | None = None,
 ) -> None:
-    """Write frames as H.264 in an .mp4 file, whole or not at all.
+    """Write frames as H.264 in an .mp4 file, completely or not at all.
 
     Args:
-        path: a new file, its name ends in .mp4.
-        frames: pictures (height, width, 3) of one size, both even.
-        times: (n,) seconds, increasing, one a frame; rounded to 1/90000 s.
-        crf: constant rate factor, 0 (lossless) to 51.
-        beside: texts of other new files that belong to it, written before it is to be seen.
+        path: New file, whose name ends in .mp4.
+        frames: Pictures (height, width, 3) of one size with even height and width.
+        times: (n,) time of each frame in seconds, increasing; rounded to 1/90000 s.
+        crf: Constant rate factor, 0 (lossless) to 51.
+        beside: Texts of other new files that belong to it; they are written before the film becomes
+            visible.
 
     Raises:
-        InputError: the file exists or cannot be written, or the frames have no size that can be
+        InputError: The file exists or cannot be written, or the size of the frames cannot be
             encoded.
     """
     if path.suffix != ".mp4":
         raise InputError(f"{path}: expected a name that ends in .mp4")
     refuse_existing([path])
     try:
-        # FFmpeg tells the format by the name.
+        # FFmpeg derives the format from the name.
         with replacing(path, keep_ending=True) as partial:
             _encode(partial, frames, times, crf)
-            # Encoding takes long enough for somebody to have made the file meanwhile.
+            # Encoding takes long; the file may have been created meanwhile.
             refuse_existing([path])
             publish(beside or {})
     except OSError as error:
@@ -72,18 +71,18 @@ def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None
     if len(times) > 1:
         seconds = Fraction(max(1, int(ticks[-1])), _TICKS)
         rate = Fraction(len(times) - 1, 1) / seconds
-    # the index stands first, so that a file cut short can still be read up to the cut
+    # Write the index first, so that a truncated file can be read up to the end.
     with av.open(str(path), "w", options={"movflags": "faststart"}) as file:
         stream = file.add_stream("libx264", rate=rate.limit_denominator(1000))
         stream.pix_fmt = "yuv420p"
         stream.thread_count = 1
-        # the same bytes on every processor and in every run: x264's fast paths alone give another
-        # file now and then
+        # Reproducible output on every processor: with x264's fast code paths alone, the file
+        # differs occasionally.
         exact = {"x264-params": "cpu-independent=1"}
         stream.options = {
             "crf": str(crf),
             "preset": "veryfast",
-            # no frames between frames, so that they are stored in the order of their times
+            # No B-frames, so that frames are stored in the order of their times.
             "bf": "0",
             **exact,
         }
@@ -96,8 +95,8 @@ def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None
                     raise InputError(
                         f"{path}: expected an even number of pixels, found {picture.shape[:2]}"
                     )
-            # one converter on one thread: PyAV's own starts as many threads as there are cores for
-            # every frame
+            # One converter with one thread: by default PyAV starts as many threads as there are
+            # cores for each frame.
             coloured = av.VideoFrame.from_ndarray(picture, format="rgb24")
             frame = converter.reformat(coloured, format="yuv420p", threads=1)
             frame.pts = tick
@@ -107,18 +106,18 @@ def _encode(path: Path, frames: Iterable[Image], times: Array, crf: int) -> None
 
 
 class Video:
-    """A video file, read frame by frame, as often as one likes.
+    """Video file that can be read frame by frame, repeatedly.
 
     Args:
-        path: any file that FFmpeg reads.
-        fps: frames a second, instead of the file's own time stamps.
+        path: Any file that FFmpeg reads.
+        fps: Frame rate in frames per second, instead of the file's own time stamps.
 
     Attributes:
-        notes: what was wrong with the file but did not keep it from being read, in sentences;
-            complete after a pass.
+        notes: Faults of the file that did not prevent reading, in sentences; complete after one
+            pass.
 
     Raises:
-        InputError: no such file, or nothing in it is video.
+        InputError: The file does not exist, or contains no video.
     """
 
     def __init__(self, path: Path, fps: float | None = None) -> None:
@@ -132,7 +131,7 @@ class Video:
             pass
 
     def __iter__(self) -> Iterator[tuple[float, Image]]:
-        """Time in seconds and picture of each frame that can be read; times increase."""
+        """Iterate over time in seconds and picture of each readable frame; times increase."""
         self.notes = []
         last = -np.inf
         count = 0
@@ -146,7 +145,7 @@ class Video:
                     break
                 time = count / self.fps if self.fps else seconds
                 count += 1
-                # a recording's times increase; a file's need not
+                # The times of a recording must increase, those of a file need not.
                 if time <= last:
                     dropped += 1
                     continue
@@ -160,7 +159,7 @@ class Video:
             file = av.open(str(self.path))
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read ({error.strerror})") from None
-        # Besides what Python has a name for, such as an end of the file.
+        # FFmpeg errors without a Python class, such as an unexpected end of the file.
         except (ValueError, av.FFmpegError):
             raise InputError(f"{self.path}: {_why_not(self.path)}") from None
         if not file.streams.video:
@@ -171,7 +170,7 @@ class Video:
         return file
 
     def _decoded(self, file: Any) -> Iterator[tuple[float, Image | None]]:
-        """Each frame's time and picture; a last pair without picture where the file breaks off."""
+        """Iterate over time and picture of each frame; the picture is None after an error."""
         av = imported("av")
         stream = file.streams.video[0]
         stream.thread_count = 1
@@ -188,7 +187,14 @@ class Video:
             yield np.nan, None
 
     def _judge(self, count: int, stated: int, broken: bool, dropped: int) -> None:
-        """Note what was wrong with a pass; refuse a file of which nothing was read."""
+        """Add notes about faults of a pass; refuse a file without readable frames.
+
+        Args:
+            count: Number of frames read.
+            stated: Number of frames that the file states; 0 if unknown.
+            broken: Whether decoding failed.
+            dropped: Number of frames whose times do not increase.
+        """
         if not count:
             raise InputError(
                 f"{self.path}: no frame of it can be read; "
@@ -202,19 +208,19 @@ class Video:
 
 
 def _upright(frame: Any, degrees: float) -> Image:
-    """The picture as a viewer shows it: telephones store how they were held."""
+    """Rotate the picture as a viewer does: telephones store how they were held."""
     picture: Image = frame.to_ndarray()
     turns = round(degrees / 90) % 4
     return np.ascontiguousarray(np.rot90(picture, turns)) if turns else picture
 
 
 def _why_not(path: Path) -> str:
-    """Why a file that no reader knows is none, from how it begins."""
+    """Describe why a file is not a readable video, from its first bytes."""
     with path.open("rb") as file:
         start = file.read(_HEAD)
     if not start:
         return "expected a video, found an empty file"
-    # an MP4 file begins so, and its index may stand at the end
+    # These bytes begin an MP4 file, whose index may be at its end.
     if start[4:8] == b"ftyp":
         return "breaks off before its index, so no frame can be found; copy the whole file again"
     text = all(32 <= byte < 127 or byte in b"\t\r\n" for byte in start)

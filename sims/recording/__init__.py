@@ -1,11 +1,13 @@
-"""Measured data on disk, `NAME.csv` and `NAME.toml`; the rooms in the order in which to read them.
+"""Measured data on disk, `NAME.csv` and `NAME.toml`.
 
-* `recording`: what a recording is, and how one is read: the contract, and all that others need
-* `description`: the TOML file, what the columns are
-* `table`: the CSV file, cell by cell; `fast` reads large faultless ones
+The main modules, in the order in which to read them:
+
+* `recording`: the data classes of a recording and the functions that read one
+* `description`: the TOML file, which states what the columns are
+* `table`: the CSV file, read cell by cell; `fast` reads large faultless ones
 * `frame`: columns of a pandas DataFrame, checked as those of a CSV file
-* `units`: how the file's units become SI
-* `write`: a recording written such that reading gives the same back
+* `units`: conversion of the file's units to SI units
+* `write`: write a recording such that reading gives it back unchanged
 """
 
 from sims.recording.recording import Recording, Run, read_recording, system_of

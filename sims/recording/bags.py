@@ -1,10 +1,10 @@
-"""ROS bags as folders of logs: a topic is a log, ``drive.mcap/joint_states`` that of
-``/joint_states``.
+"""Read ROS bags as folders of logs, one log per topic.
 
-Bags of ROS 1 (``.bag``) and ROS 2 (a folder with its ``metadata.yaml``, ``.db3``, ``.mcap``) are
-read by rosbags, message by message: what is kept of one are its numbers. Entries are named as ROS
-does, ``velocity[2]``, and by the message's own names where it has some, ``position.elbow``. Stamps
-are those of the message's header, or of its writing where it has none, seconds in ``time``.
+The log ``drive.mcap/joint_states`` is the topic ``/joint_states``. Bags of ROS 1 (``.bag``) and ROS
+2 (a folder with its ``metadata.yaml``, ``.db3``, ``.mcap``) are read message by message with
+rosbags, and only the numbers of a message are stored. Entries are named as in ROS, ``velocity[2]``,
+or by the names in the message where it has some, ``position.elbow``. The column ``time`` holds the
+stamps in seconds: those of the message headers, or the times of writing where there is no header.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ import numpy as np
 from sims.base import Array, InputError, frozen
 
 ENDINGS = (".bag", ".mcap", ".db3")
-"""Of bags that are files."""
+"""File name endings of bags that are single files."""
 TIME = "time"
-"""The column of stamps."""
+"""Name of the column of time stamps."""
 LONGEST = 64
-"""Entries of a list that are columns: an image is no signal."""
+"""Maximum length of a list whose entries become columns; longer lists are skipped."""
 DEEPEST = 6
-"""Messages within messages."""
+"""Maximum depth of nested messages that are read."""
 _NANO = 1e-9
 
 
 def is_bag(path: Path) -> bool:
-    """Whether this is a bag, a file or a folder."""
+    """Return whether a path is a ROS bag, as a file or a folder."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     return path.suffix.lower() in ENDINGS and path.is_file()
 
 
 def bag_of(path: Path) -> tuple[Path, str] | None:
-    """The bag that a path leads into, and the topic there; None where it leads into none."""
+    """Split a path into a bag and a topic inside it; None if the path is not inside a bag."""
     for parent in path.parents:
         if parent.exists():
             if not is_bag(parent):
@@ -49,25 +49,28 @@ def bag_of(path: Path) -> tuple[Path, str] | None:
 
 
 def topics(bag: Path) -> list[str]:
-    """The topics of a bag, without the slash that they begin with.
+    """List the topics of a bag, without their leading slash.
 
     Raises:
-        InputError: it cannot be read, or rosbags is not installed.
+        InputError: The bag cannot be read, or rosbags is not installed.
     """
     with _opened(bag) as reader:
         return sorted({connection.topic.lstrip("/") for connection in reader.connections})
 
 
 def read_topic(bag: Path, topic: str, wanted: Collection[str] = ()) -> dict[str, Array]:
-    """(T,) numbers of a topic by name, with its stamps, in their order.
+    """Read the numbers of a topic, ordered by time stamp.
 
     Args:
-        bag: a file or folder.
-        topic: with the slash that it begins with.
-        wanted: names of numbers, in any case, that are kept; all where none are given.
+        bag: Bag file or folder.
+        topic: Name of the topic with its leading slash.
+        wanted: Names of the numbers to store, in any case; all if empty.
+
+    Returns:
+        Columns (T,) by name, including the time stamps.
 
     Raises:
-        InputError: there is no such topic, or its messages cannot be read.
+        InputError: The bag has no such topic, or its messages cannot be read.
     """
     table = _Table(wanted)
     with _opened(bag) as reader:
@@ -91,29 +94,35 @@ def _opened(bag: Path) -> Iterator[Any]:
             f"{bag}: needs rosbags to read it, not installed (pip install rosbags)"
         ) from None
     try:
-        # Bags of ROS 2 did not hold their types before Iron: those of Humble are assumed then.
+        # Bags of ROS 2 store their message types only since Iron; older ones are read with
+        # Humble's.
         usual = get_typestore(Stores.ROS2_HUMBLE)
         with AnyReader([bag], default_typestore=usual) as reader:
             yield reader
     except (InputError, MemoryError, KeyboardInterrupt):
         raise
-    except Exception as error:  # the readers of three formats raise what they like
+    except Exception as error:  # the readers of the three formats raise many kinds of errors
         what = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{bag}: not a bag that can be read: {what[:300]}") from None
 
 
 class _Table:
-    """Numbers of messages, by name."""
+    """Numbers of the messages of one topic, by name."""
 
     def __init__(self, wanted: Collection[str] = ()) -> None:
-        # Runs may be told apart by a number of their own.
+        # A column named run may number the runs of the log.
         self.wanted = {name.strip().lower() for name in (*wanted, "run")} if wanted else set()
         self.stamps = array("d")
         self.written = array("d")
         self.numbers: dict[str, array[float]] = {}
 
     def add(self, message: Any, written: int) -> None:
-        """The numbers of one more message; what an earlier one had and it lacks is missing."""
+        """Append the numbers of one message; numbers missing from it become NaN.
+
+        Args:
+            message: Deserialised message.
+            written: Time of writing in nanoseconds.
+        """
         row = len(self.stamps)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
         seconds = 0.0 if stamp is None else stamp.sec + _NANO * stamp.nanosec
@@ -127,15 +136,15 @@ class _Table:
             column.append(value)
 
     def columns(self) -> dict[str, Array]:
-        """All of it, in the order of the stamps."""
+        """Return all columns (T,) by name, ordered by time stamp."""
         rows = len(self.stamps)
         stamps = np.array(self.stamps)
-        # A header that nobody filled in says nothing.
+        # Header stamps of zero were not filled in: use the times of writing instead.
         times = stamps if rows and (stamps > 0).all() else np.array(self.written)
         order = None if (np.diff(times) >= 0).all() else np.argsort(times, kind="stable")
         result = {TIME: frozen(times if order is None else times[order])}
         for name in list(self.numbers):
-            # Given back one by one: a long bag would stand in memory twice.
+            # Release each column after conversion; otherwise a long bag would be in memory twice.
             column = self.numbers.pop(name)
             column.extend([np.nan] * (rows - len(column)))
             values = np.frombuffer(column)
@@ -144,7 +153,10 @@ class _Table:
 
 
 def _numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
-    """Every number of a message with its name; of lists with names, as joints' states, by these."""
+    """Iterate over the numbers of a message with their names.
+
+    Entries of a list get the names in the message where it has some, as in joint states.
+    """
     if isinstance(value, bool | int | float | np.number | np.bool_):
         yield path, float(value)
     elif is_dataclass(value) and depth < DEEPEST:
@@ -165,7 +177,7 @@ def _numbers(path: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
 
 
 def _named(values: Any, names: Any) -> bool:
-    """Whether a list has a name for each of its numbers."""
+    """Return whether a list has a name for each of its numbers."""
     if not isinstance(names, Sequence) or isinstance(names, str) or not names:
         return False
     listed = isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "fiu"

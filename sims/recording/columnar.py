@@ -1,4 +1,4 @@
-"""Tables of columns (Parquet), as numbers by name."""
+"""Read the numeric columns of Parquet tables."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import numpy as np
 from sims.base import Array, InputError, frozen
 
 WIDEST = 10_000
-"""Columns of a log, and entries of a list in a cell."""
+"""Maximum number of columns of a log, and of entries of a list in a cell."""
 
 
 def columns_of(table: Any) -> tuple[dict[str, Array], list[str]]:
-    """(T,) or (T, k) numbers of a pyarrow table by name, and the names of what holds none."""
+    """Read the numeric columns of a pyarrow table.
+
+    Returns:
+        Numbers by column name, (T,) or (T, k), and the names of the columns without numbers.
+    """
     columns: dict[str, Array] = {}
     texts = []
     for name in table.column_names:
@@ -27,13 +31,13 @@ def columns_of(table: Any) -> tuple[dict[str, Array], list[str]]:
 
 
 def unreadable(path: Path, error: Exception) -> InputError:
-    """What to say of a file that pyarrow does not read."""
+    """Make the error for a file that pyarrow cannot read."""
     what = " ".join(str(error).split()) or type(error).__name__
     return InputError(f"{path}: not a Parquet file: {what[:300]}")
 
 
 def may_hold(kind: Any) -> bool:
-    """Whether columns of a type may be numbers, or lists of them."""
+    """Return whether columns of a pyarrow type hold numbers, times or lists of them."""
     import pyarrow
 
     if _is_list(kind):
@@ -50,7 +54,7 @@ def _is_list(kind: Any) -> bool:
 
 
 def _numbers(column: Any) -> Array | None:
-    """(T,) or (T, k) numbers of a column; None where it holds none."""
+    """Return the numbers (T,) or (T, k) of a column; None if it holds none."""
     import pyarrow
 
     kind = column.type

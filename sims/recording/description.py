@@ -1,5 +1,6 @@
-"""The description of a recording, `NAME.toml`: what its columns are, in which units, and what is
-known of each run.
+"""Read and check the description `NAME.toml` of a recording.
+
+It states the signal and unit of each column and what is known about each run.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from sims.system import System
 from sims.user_toml import checked, fault, finite, known, read_toml, table, text
 
 Declared: TypeAlias = type[Simulator] | type[System]
-"""What a recording is checked against: channels, inputs, constants and states of a system."""
+"""System or simulator that declares the channels, inputs, constants and states of a recording."""
 
 _KEYS = (
     "system",
@@ -39,18 +40,17 @@ _KEYS = (
     "extra",
     "time",
 )
-"""What may stand in the file."""
+"""Keys allowed at the top level of the file."""
 
 HOLDS = ("zero", "linear")
-"""What an input does from one sample to the next: it holds its value, or goes straight to the next
-one."""
+"""How an input continues between two samples: it is held (zero order) or interpolated linearly."""
 
 _NEVER = 1e12
-"""Times the usual size of a channel, and that part of it, which no sensor's noise is."""
+"""Limit of plausible sensor noise, as a factor above and below the typical size of its channel."""
 
 
 class _Column(NamedTuple):
-    """How a column becomes SI, and the table that says so."""
+    """Conversion of a column to SI units, and the table of the description that states it."""
 
     scale: Scale
     table: Mapping[str, Any]
@@ -58,7 +58,7 @@ class _Column(NamedTuple):
 
 @dataclass(frozen=True)
 class RunMarks:
-    """What the description says of one run; `held_out` is None where it says nothing."""
+    """Metadata of one run in the description; `held_out` is None where it is not stated."""
 
     constants: Mapping[str, float]
     initial: Mapping[str, float]
@@ -67,23 +67,24 @@ class RunMarks:
 
 @dataclass(frozen=True)
 class Description:
-    """A checked description.
+    """Checked description of a recording.
 
     Attributes:
-        system: name of the system.
-        title: one line.
-        channels: how each channel's column becomes SI.
-        inputs: the same for each input's.
-        noise: each channel's noise where stated, 1 sigma, SI units.
-        constants: known numbers, SI units.
-        runs: by name, only those the description mentions.
-        extra: units of columns that belong to no channel or input, as written.
-        begins: how those of them become SI that are states of what floats, which no channel shows:
-            a run begins as their first cells say.
-        linear: inputs that go straight from one sample to the next.
-        sources: where the columns stand.
-        wrapped: angles whose whole turns are restored, each with the input that tells the turn.
-        switches: columns that say when drives are on.
+        system: Name of the system.
+        title: Title in one line.
+        channels: Conversion of each channel's column to SI units.
+        inputs: Conversion of each input's column to SI units.
+        noise: Standard deviation of each channel's noise where stated, SI units.
+        constants: Known constants, SI units.
+        runs: Metadata by run name, only for the runs that the description mentions.
+        extra: Units, as written, of columns that belong to no channel or input.
+        begins: Conversion to SI units of those extra columns that hold poses of floating bodies.
+            The first cell in a run is the initial state, which no channel shows.
+        linear: Inputs that are interpolated linearly between samples.
+        sources: Files and columns from which the signals are read.
+        wrapped: Angles whose whole turns are restored, each with the input that determines the
+            turn.
+        switches: Columns that say when drives are on.
     """
 
     system: str
@@ -103,13 +104,13 @@ class Description:
 
 @dataclass(frozen=True)
 class ModelFile:
-    """The robot that a recording is of.
+    """Model file of the robot that was recorded, with the settings of the description.
 
     Attributes:
-        path: of its model file.
-        actuators: that the file lacks, by name.
-        engine: time step and integrator other than the file's.
-        free: numbers that nobody knows, and that are estimated unless others are asked for.
+        path: Path of the model file.
+        actuators: Actuators that are missing in the file, by name.
+        engine: Time step and integrator, where they differ from those of the file.
+        free: Unknown parameters that are estimated unless others are requested.
     """
 
     path: Path
@@ -119,14 +120,14 @@ class ModelFile:
 
 
 def model_of(path: str | Path, model: str | Path | None = None) -> ModelFile | None:
-    """The model file that a recording's description states; None where it states a system.
+    """Read the model file that a recording's description states; None if it states a system.
 
     Args:
-        path: the recording's table, `NAME.csv`.
-        model: a model file in place of the one that the description states.
+        path: Table of the recording, `NAME.csv`.
+        model: Model file to use instead of the stated one.
 
     Raises:
-        InputError: the description is missing or malformed, or states both.
+        InputError: The description is missing or malformed, or states both system and model.
     """
     return model_in(*read_meta(Path(path)), model)
 
@@ -134,15 +135,16 @@ def model_of(path: str | Path, model: str | Path | None = None) -> ModelFile | N
 def model_in(
     description: Path, meta: Mapping[str, Any], model: str | Path | None = None
 ) -> ModelFile | None:
-    """The model file that a description states; None where it states a system.
+    """Return the model file that a description states; None if it states a system.
 
     Args:
-        description: its path, which messages begin with; the model file is found from its folder.
-        meta: its content.
-        model: a model file in place of the one that it states.
+        description: Path of the description, for messages; the path of the model file is relative
+            to its folder.
+        meta: Content of the description.
+        model: Model file to use instead of the stated one.
 
     Raises:
-        InputError: it is malformed, or states both.
+        InputError: The description is malformed, or states both system and model.
     """
     if model is None and "model" not in meta:
         return None
@@ -156,7 +158,7 @@ def model_in(
 
 
 def _free(path: Path, meta: Mapping[str, Any]) -> tuple[str, ...]:
-    """The numbers of a robot that its recording leaves free."""
+    """Return the names of the robot parameters that the description leaves free."""
     given = meta.get("free", [])
     if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
         raise fault(path, "free", 'names, as ["damping@*"]', given)
@@ -164,22 +166,24 @@ def _free(path: Path, meta: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def system_of(path: str | Path) -> str:
-    """The name of the system that a recording's description states.
+    """Read the name of the system that a recording's description states.
 
     Args:
-        path: the recording's table, `NAME.csv`.
+        path: Table of the recording, `NAME.csv`.
 
     Raises:
-        InputError: the description is missing or malformed, or states none.
+        InputError: The description is missing or malformed, or states no system.
     """
     return _system(*read_meta(Path(path)))
 
 
 def description_of(table: Path) -> Path:
-    """`NAME.toml` beside the table; itself where it is named in place of the table.
+    """Return the path of the description `NAME.toml` of a table.
+
+    A path of the description itself is returned unchanged.
 
     Raises:
-        InputError: `table` cannot be the name of one.
+        InputError: `table` has no file name.
     """
     if not table.name:
         raise InputError(f"expected a recording's table, NAME.csv, found '{table}'")
@@ -187,15 +191,18 @@ def description_of(table: Path) -> Path:
 
 
 def stated_columns(path: Path, declared: Declared) -> dict[str, tuple[str, float, float]]:
-    """By channel and input, the unit that a recording's description states, the factor by which the
-    numbers of the column become SI, and the `scale` that is part of it.
+    """Read the unit and the conversion to SI units of each channel and input.
 
     Args:
-        path: the recording's table, `NAME.csv`.
-        declared: its system.
+        path: Table of the recording, `NAME.csv`.
+        declared: System of the recording.
+
+    Returns:
+        By channel and input: the stated unit, the factor from the numbers of the column to SI
+        units, and the stated `scale`, which is part of that factor.
 
     Raises:
-        InputError: the description is missing or malformed.
+        InputError: The description is missing or malformed.
     """
     description = description_of(path)
     meta = read_toml(description)
@@ -210,21 +217,24 @@ def stated_columns(path: Path, declared: Declared) -> dict[str, tuple[str, float
 
 
 def read_meta(table: Path) -> tuple[Path, dict[str, Any]]:
-    """The path and the content of the description of a recording.
+    """Read the description of a recording.
 
     Args:
         table: `NAME.csv`, or `NAME.toml` itself.
 
+    Returns:
+        Path and content of the description.
+
     Raises:
-        InputError: the recording or its description is missing, or it is not TOML.
+        InputError: The recording or its description is missing, or it is not TOML.
     """
     description = description_of(table)
     try:
         missing = not description.exists()
-    except (OSError, ValueError):  # not a path: `require_file` says why
+    except (OSError, ValueError):  # not a valid path; `require_file` reports the reason
         missing = True
     if missing:
-        # The message is about the file that the user named.
+        # The message refers to the file that the user named.
         require_file(table, "a recording, NAME.csv with NAME.toml beside it")
         raise InputError(
             f"{description}: no such file; expected the description of {table.name}: its system or "
@@ -237,12 +247,15 @@ def check_description(path: Path, meta: Mapping[str, Any], declared: Declared) -
     """Check a description against the system's channels, inputs, constants and states.
 
     Args:
-        path: what messages begin with.
-        meta: its content, as in `NAME.toml`.
-        declared: the system, or a simulator of it.
+        path: Path of the description, for messages.
+        meta: Content of the description, as in `NAME.toml`.
+        declared: System, or simulator of it.
+
+    Returns:
+        The checked description.
 
     Raises:
-        InputError: anything malformed, in one line.
+        InputError: The description is malformed; the message is one line.
     """
     _known(path, "", meta, _KEYS)
     if "free" in meta and "model" not in meta:
@@ -256,10 +269,10 @@ def check_description(path: Path, meta: Mapping[str, Any], declared: Declared) -
         raise InputError(f"{path}: expected at least one [channels.NAME] table, found none")
     constants = _constants(path, "constants", meta.get("constants", {}), declared)
     _possible(path, "constants", constants, declared)
-    # Whether the table has these runs is known only when it has been read (`check_names`).
+    # The names of the runs are checked after the table was read (`check_names`).
     marks = table(path, "runs", meta.get("runs", {}))
     runs = {name: _run(path, name, own, declared) for name, own in marks.items()}
-    # A robot has no name of a system: its model file stands for it.
+    # A robot has no system name: its model file is stated instead.
     robotic = declared.has_model
     extra = _extra(path, meta, declared)
     sources = read_sources(
@@ -292,8 +305,9 @@ def _wrapped(
     inputs: Mapping[str, _Column],
     declared: Declared,
 ) -> dict[str, str]:
-    """Return the channels whose whole turns are restored, each with the input that tells the turn,
-    or an empty name.
+    """Return the channels whose whole turns are restored.
+
+    Each has the name of the input that determines the turn, or an empty name.
     """
     units = {channel.name: channel.unit for channel in declared.channels}
     result = {}
@@ -314,7 +328,7 @@ def _wrapped(
 def _switches(
     path: Path, meta: Mapping[str, Any], declared: Declared, sources: Sources
 ) -> tuple[DriveSwitch, ...]:
-    """The columns that say when drives are on, checked."""
+    """Read and check the columns that say when drives are on."""
     switches = read_switches(path, meta)
     names = [signal.name for signal in (*declared.channels, *declared.inputs)]
     actuators = [name.removeprefix("u.") for name in names if name.startswith("u.")]
@@ -323,10 +337,15 @@ def _switches(
 
 
 def check_names(path: Path, marked: Iterable[str], there: Iterable[str]) -> None:
-    """Check that the description marks only runs which the table has.
+    """Check that all runs in the description exist in the table.
+
+    Args:
+        path: Path of the description, for messages.
+        marked: Names of the runs in the description.
+        there: Names of the runs in the table.
 
     Raises:
-        InputError: it marks another.
+        InputError: The description mentions another run.
     """
     _known(path, "runs", marked, there)
 
@@ -343,18 +362,18 @@ def _system(path: Path, meta: Mapping[str, Any]) -> str:
 
 
 def afloat(declared: Declared) -> Mapping[str, str]:
-    """Units of the states of what floats, by name; none of what is no robot."""
+    """Return the units of the states of floating bodies, by name; empty if there are none."""
     units: Mapping[str, str] = getattr(_system_of(declared), "afloat", {})
     return units
 
 
 def _system_of(declared: Declared) -> object:
-    """The system of a simulator, or the system itself."""
+    """Return the system of a simulator, or the system itself."""
     return getattr(declared, "system", declared)
 
 
 def _refuse_inputs(path: Path, meta: Mapping[str, Any], declared: Declared) -> None:
-    """Refuse inputs whose effect depends on more than a recording has."""
+    """Refuse inputs whose effect depends on quantities that a recording does not contain."""
     reasons: Mapping[str, str] = getattr(_system_of(declared), "refused_inputs", {})
     given = dotted(table(path, "inputs", meta.get("inputs", {})), reasons)
     for name in (name for name in reasons if name in given):
@@ -362,7 +381,7 @@ def _refuse_inputs(path: Path, meta: Mapping[str, Any], declared: Declared) -> N
 
 
 def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: Declared) -> None:
-    """Refuse what floats among the channels, and say where it belongs."""
+    """Refuse poses of floating bodies among the channels, and explain where to state them."""
     units = afloat(declared)
     given = dotted(table(path, "channels", meta.get("channels", {})), units)
     for name in (name for name in units if name in given):
@@ -375,7 +394,7 @@ def _refuse_poses(path: Path, meta: Mapping[str, Any], declared: Declared) -> No
 def _columns(
     path: Path, kind: str, meta: Mapping[str, Any], declared: Sequence[Channel]
 ) -> dict[str, _Column]:
-    """The columns of one kind, channel or input, each with its scale."""
+    """Return the conversion of each column of one kind ("channel" or "input")."""
     units = {signal.name: signal.unit for signal in declared}
     given = dotted(table(path, f"{kind}s", meta.get(f"{kind}s", {})), units)
     known(f"{kind} in {path}", given, units)
@@ -383,8 +402,17 @@ def _columns(
 
 
 def dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """Entries whose names have dots, which TOML takes for tables in tables unless they are quoted:
-    ``[channels.q.elbow]`` is ``q.elbow``.
+    """Flatten entries whose names contain dots.
+
+    TOML reads unquoted dotted names as nested tables: ``[channels.q.elbow]`` becomes the entry
+    ``q.elbow``.
+
+    Args:
+        given: Entries as read from TOML.
+        names: Names that may contain dots.
+
+    Returns:
+        The entries by their full names.
     """
     result: dict[str, Any] = {}
     for name, value in given.items():
@@ -400,7 +428,7 @@ def dotted(given: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
 def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
     where, usual = f"{kind} {name}", f'unit = "{unit}"'
     own = table(path, where, value, f"a table with {usual}")
-    # The noise of a signal that is put in is nothing that a simulation could use.
+    # Noise of an input is not allowed, because simulations cannot use it.
     allowed = (
         "unit",
         "scale",
@@ -410,7 +438,7 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
         *(("noise", "unwrap") if kind == "channel" else ("hold",)),
     )
     _known(path, f"{kind}s.{name}", own, allowed)
-    # No unit is no SI unit: a log in degrees without a word of it would be read as radians.
+    # The unit is required: a log in degrees without a unit would be read as radians.
     stated = text(path, where, own.get("unit"), f"{usual} or one that converts to it")
     try:
         converted = scale(stated, unit)
@@ -421,14 +449,14 @@ def _column(path: Path, kind: str, name: str, value: Any, unit: str) -> _Column:
     factor = finite(path, f"{kind}s.{name}.scale", own.get("scale", 1.0))
     if factor == 0:
         raise fault(path, f"{kind}s.{name}.scale", "a factor that is not zero", own["scale"])
-    # The offset is in the unit that is stated: a zero of an encoder reads as it is written there.
+    # The offset is in the stated unit, so that the zero of an encoder can be copied from its log.
     offset = finite(path, f"{kind}s.{name}.offset", own.get("offset", 0.0))
     gain = factor * converted.gain
     return _Column(Scale(gain, converted.gain * offset + converted.offset), own)
 
 
 def _hold(path: Path, name: str, column: _Column) -> bool:
-    """Whether an input goes straight from one sample to the next."""
+    """Return whether an input is interpolated linearly between samples."""
     hold = column.table.get("hold", "zero")
     if hold not in HOLDS:
         raise fault(path, f"inputs.{name}.hold", " or ".join(f'"{one}"' for one in HOLDS), hold)
@@ -436,13 +464,13 @@ def _hold(path: Path, name: str, column: _Column) -> bool:
 
 
 def _noises(path: Path, channels: Mapping[str, _Column], declared: Declared) -> dict[str, float]:
-    """Each channel's noise where stated, SI units."""
+    """Return the noise of each channel where stated, SI units."""
     sizes = {channel.name: channel.scale for channel in declared.channels}
     noises = {}
     for name, column in channels.items():
         if "noise" not in column.table:
             continue
-        # A spread knows no offset, and no sign.
+        # A standard deviation has no offset and no sign.
         noises[name] = abs(column.scale.gain) * _noise(path, name, column.table["noise"])
         if not 1 / _NEVER < noises[name] / sizes[name] < _NEVER:
             wanted = f"that of values of about {sizes[name]:g} in SI units"
@@ -459,8 +487,8 @@ def _noise(path: Path, name: str, value: Any) -> float:
 
 
 def _extra(path: Path, meta: Mapping[str, Any], declared: Declared) -> dict[str, str]:
-    """Units of the columns that are no channel or input."""
-    # A channel left out by mistake must not pass for a column that nobody uses.
+    """Return the units of the columns that belong to no channel or input."""
+    # A forgotten channel must not be accepted as an unused column.
     taken = ["run", "t", *(signal.name for signal in (*declared.channels, *declared.inputs))]
     units = {}
     given = dotted(table(path, "extra", meta.get("extra", {})), afloat(declared))
@@ -477,7 +505,7 @@ def _extra(path: Path, meta: Mapping[str, Any], declared: Declared) -> dict[str,
 
 
 def _begins(path: Path, extra: Mapping[str, str], declared: Declared) -> dict[str, Scale]:
-    """How columns become SI that say where what floats is."""
+    """Return the conversion to SI units of the columns with initial poses of floating bodies."""
     begins = {}
     for name, unit in afloat(declared).items():
         if name in extra:
@@ -496,7 +524,7 @@ def _run(path: Path, name: str, value: Any, declared: Declared) -> RunMarks:
     held_out = own.get("held_out")
     if held_out is not None:
         checked(path, f"{where}.held_out", held_out, bool, "true or false")
-    # A run's constants may stand in a table of their own or among its other entries.
+    # The constants of a run may be in a table of their own or among its other entries.
     constants = _constants(path, f"{where}.constants", own.get("constants", {}), declared)
     direct = {key: number for key, number in own.items() if key in allowed}
     for twice in constants.keys() & direct.keys():

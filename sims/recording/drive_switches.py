@@ -1,8 +1,8 @@
-"""Columns of a recording that say when a robot's drives are on.
+"""Columns of a recording that say when the drives of a robot are on.
 
-``[actuators.NAME] enable = "COLUMN"`` names a column that is zero while the drive is off, and
-``disable`` one that is not zero then, as that of an emergency stop. An actuator that is off exerts
-nothing in simulations of the run.
+``[actuators.NAME] enable = "COLUMN"`` names a column that is zero while the drive is off;
+``disable`` names one that is not zero then, such as an emergency stop. An actuator that is off
+exerts no force in simulations of the run.
 """
 
 from __future__ import annotations
@@ -20,23 +20,24 @@ from sims.user_toml import table, text, toml_key
 
 Mask = NDArray[np.bool_]
 Run: TypeAlias = Any
-"""A `sims.recording.recording.Run`, whose module imports this one."""
+"""Alias for `sims.recording.recording.Run`, whose module imports this one."""
 
 KEYS = ("enable", "disable")
-"""Keys of ``[actuators.NAME]`` that name such a column."""
+"""Keys of ``[actuators.NAME]`` that name a switch column."""
 FEWEST = 10
-"""Smallest number of samples of a part of a run: fewer say nothing beside an initial state."""
+"""Minimum number of samples of a part of a run; fewer determine no more than an initial state."""
 MOST_RUNS = 6
-"""Maximum number of runs that a message names."""
+"""Maximum number of runs named in a message."""
 
 
 class DriveSwitch(NamedTuple):
-    """A column that says when a drive is on.
+    """Column that says when a drive is on.
 
     Attributes:
-        actuator: of the model.
-        column: of the table, one that is neither a channel nor an input.
-        zero_is_off: whether the drive is off where the column is zero, or where it is not.
+        actuator: Name of the actuator in the model.
+        column: Name of the column, which is neither a channel nor an input.
+        zero_is_off: True if the drive is off where the column is zero, False if it is off where the
+            column is not zero.
     """
 
     actuator: str
@@ -44,11 +45,14 @@ class DriveSwitch(NamedTuple):
     zero_is_off: bool
 
     def off(self, run: Run) -> Mask:
-        """(T,) whether the drive is off at each sample; a missing cell is as the one before it."""
+        """Return whether the drive is off at each sample (T,).
+
+        A missing cell has the value of the previous one.
+        """
         values = run.extra[self.column]
         there = np.isfinite(values)
         last = np.maximum.accumulate(np.where(there, np.arange(values.size), -1))
-        # Before the first cell the drive is taken to be as that says.
+        # Before its first value, the column is assumed to have that value.
         first = int(np.argmax(there)) if there.any() else 0
         filled = values[np.where(last < 0, first, last)]
         off: Mask = (filled == 0) == self.zero_is_off
@@ -56,25 +60,25 @@ class DriveSwitch(NamedTuple):
 
     @property
     def line(self) -> str:
-        """The table of the description that states it."""
+        """Line of the description that states this switch."""
         key = "enable" if self.zero_is_off else "disable"
         return f'[actuators.{toml_key(self.actuator)}] {key} = "{self.column}"'
 
     @property
     def condition(self) -> str:
-        """When the drive is off, in words."""
+        """Condition under which the drive is off, in words."""
         return f"{self.column} is {'0' if self.zero_is_off else 'not 0'}"
 
 
 def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...]:
-    """Return the columns that a description names.
+    """Read the switch columns from a description.
 
     Args:
-        path: of the description, which messages begin with.
-        meta: its content.
+        path: Path of the description, for messages.
+        meta: Content of the description.
 
     Raises:
-        InputError: a name is not a text, or a drive has both keys.
+        InputError: A column name is not a text, or a drive has both keys.
     """
     found = []
     for name, own in table(path, "actuators", meta.get("actuators", {})).items():
@@ -88,14 +92,14 @@ def read_switches(path: Path, meta: Mapping[str, Any]) -> tuple[DriveSwitch, ...
 
 
 def without_switches(actuators: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tables of actuators that a model file lacks, without the keys of this module."""
+    """Return the tables of actuators that the model file lacks, without the keys of this module."""
     result = {}
     for name, own in actuators.items():
         if not isinstance(own, dict):
             result[name] = own
             continue
         rest = {key: value for key, value in own.items() if key not in KEYS}
-        # A table that names a column alone is of an actuator that the file has.
+        # A table with a switch column only belongs to an actuator of the model file.
         if rest or not own:
             result[name] = rest
     return result
@@ -108,17 +112,17 @@ def check_switches(
     taken: Sequence[str],
     are_logs: bool,
 ) -> None:
-    """Check the columns that a description names.
+    """Check the switch columns of a description.
 
     Args:
-        path: of the description.
-        switches: of `read_switches`.
-        actuators: of the model.
-        taken: names of columns with another meaning.
-        are_logs: whether the columns stand in logs, and not in the table beside.
+        path: Path of the description, for messages.
+        switches: Switch columns from `read_switches`.
+        actuators: Names of the actuators of the model.
+        taken: Names of columns with another meaning.
+        are_logs: Whether the columns are in raw logs instead of a table next to the description.
 
     Raises:
-        InputError: there is no such actuator, or the column cannot be read.
+        InputError: There is no such actuator, or the column cannot be read.
     """
     for switch in switches:
         where = f"{path}: actuators.{switch.actuator}"
@@ -139,22 +143,22 @@ def check_switches(
 
 
 class Switched(NamedTuple):
-    """Runs with what is known of drives that are off, and what is to be said of it."""
+    """Runs with masks of the drives that are off, and notes about them."""
 
     runs: tuple[Run, ...]
     notes: tuple[str, ...]
 
 
 def switched_runs(path: Path, runs: Sequence[Run], switches: Sequence[DriveSwitch]) -> Switched:
-    """State in which samples of runs drives are off.
+    """Add to each run at which samples its drives are off.
 
     Args:
-        path: of the table.
-        runs: as they were read.
-        switches: columns that say when drives are on.
+        path: Path of the table, for messages.
+        runs: Runs as read from the table.
+        switches: Columns that say when drives are on.
 
     Raises:
-        InputError: a drive is never on.
+        InputError: A drive is never on.
     """
     notes: dict[str, list[str]] = {}
     by_run: list[dict[str, Mask]] = [{} for _ in runs]
@@ -179,7 +183,12 @@ def switched_runs(path: Path, runs: Sequence[Run], switches: Sequence[DriveSwitc
 
 
 def spans_of_runs(runs: Sequence[Run], off: Sequence[Mask]) -> str:
-    """Describe in which spans of time of which runs a mask (T,) of each is set."""
+    """Describe the time spans of each run in which a mask is set.
+
+    Args:
+        runs: Runs.
+        off: Mask (T,) of each run.
+    """
     told = [
         f"run {run.name}, {_spans(run.times, mask)}"
         for run, mask in zip(runs, off, strict=True)
@@ -190,27 +199,29 @@ def spans_of_runs(runs: Sequence[Run], off: Sequence[Mask]) -> str:
 
 
 def _subject(names: Sequence[str]) -> str:
-    """Subject and verb of a sentence about actuators."""
+    """Return subject and verb of a sentence about actuators."""
     if len(names) == 1:
         return f"actuator {names[0]} exerts"
     return f"actuators {', '.join(names)} exert"
 
 
 def _spans(times: Array, off: Mask) -> str:
-    """Spans of time in which a mask is set."""
+    """Describe the time spans in which a mask (T,) is set."""
     return ", ".join(f"{times[first]:.4g} to {times[end - 1]:.4g} s" for first, end in spans(off))
 
 
 def spans(mask: Mask) -> list[tuple[int, int]]:
-    """Return the first rows of stretches in which a mask (T,) is set, and the rows after them."""
+    """Return the blocks in which a mask (T,) is set: first row, and the row after the last."""
     edges = np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))
     first, end = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
     return list(zip(first.tolist(), end.tolist(), strict=True))
 
 
 def parts_without(run: Run, off: Mask) -> list[Run]:
-    """Return the parts of a run in which a mask (T,) is not set, the run itself if it is not set
-    anywhere.
+    """Return the parts of a run in which a mask (T,) is not set.
+
+    Parts of fewer than `FEWEST` samples are left out. If the mask is set nowhere, the run itself is
+    returned.
     """
     if not off.any():
         return [run]

@@ -1,5 +1,6 @@
-"""Fast reading of large faultless tables; what it hesitates over is left to the reader that looks
-at every cell.
+"""Read large faultless CSV tables fast.
+
+Tables with anything unusual are left to the slower reader, which inspects each cell.
 """
 
 from __future__ import annotations
@@ -12,20 +13,23 @@ import numpy as np
 from sims.base import Array
 
 WORTHWHILE = 1 << 20
-"""Bytes from which on importing the fast parser pays."""
+"""Minimum size in bytes of a table for which importing the fast parser is worthwhile."""
 
 
 def read_fast(
     path: Path, header: Sequence[str], wanted: Sequence[str], gaps: Collection[str]
 ) -> tuple[list[str], dict[str, Array]] | None:
-    """Run names row by row, and the columns `wanted` as numbers; None where anything is out of the
-    ordinary.
+    """Read the run names and the numeric columns of a CSV table with pyarrow.
 
     Args:
-        path: a table whose first line is its header.
-        header: its columns, checked; one of them is ``run``.
-        wanted: columns of numbers.
-        gaps: those among them whose cells may be empty (NaN).
+        path: Table whose first line is its header.
+        header: Checked names of its columns, including ``run``.
+        wanted: Names of the numeric columns to read.
+        gaps: Those among them whose cells may be empty (NaN).
+
+    Returns:
+        Name of the run of each row, and the numeric columns (T,) by name; None if anything in the
+        table is unusual.
     """
     import pyarrow as arrow
     from pyarrow import csv
@@ -35,9 +39,9 @@ def read_fast(
     try:
         table = csv.read_csv(
             path,
-            # one thread: workers run beside each other, one a core
+            # Use one thread, because there is already one worker process per core.
             csv.ReadOptions(column_names=list(header), skip_rows=1, use_threads=False),
-            # quotes may hide commas and line ends; they are left to the other reader
+            # Quotes may hide commas and line ends; such tables are left to the other reader.
             csv.ParseOptions(quote_char=False),
             csv.ConvertOptions(
                 column_types=types,
@@ -51,7 +55,7 @@ def read_fast(
     for name in wanted:
         cells = table[name]
         values = cells.to_numpy()
-        # an empty cell is NaN and allowed in a gap; a NaN or inf that is written is not
+        # An empty cell is NaN and allowed in a gap; NaN or inf written as text is not.
         allowed = cells.null_count if name in gaps else 0
         if np.count_nonzero(~np.isfinite(values)) != allowed:
             return None

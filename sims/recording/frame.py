@@ -1,5 +1,6 @@
-"""Recordings in data frames: the columns of a pandas ``DataFrame`` as those of `NAME.csv`, checked
-by the same rules.
+"""Read recordings from pandas data frames.
+
+Columns of a ``DataFrame`` are checked by the same rules as those of `NAME.csv`.
 """
 
 from __future__ import annotations
@@ -20,30 +21,34 @@ from sims.user_toml import shown, table
 
 @runtime_checkable
 class Frame(Protocol):
-    """What is used of a pandas ``DataFrame``; pandas itself is not imported for it."""
+    """Protocol of the parts of a pandas ``DataFrame`` that are used here, without pandas."""
 
     @property
     def attrs(self) -> Any:
-        """Anything that the user noted about it."""
+        """Metadata that the user attached to the frame."""
 
     @property
     def columns(self) -> Any:
-        """Names of its columns."""
+        """Names of the columns."""
 
     @property
     def index(self) -> Any:
-        """Labels of its rows."""
+        """Labels of the rows."""
 
     @property
     def iloc(self) -> Any:
-        """Rows by number."""
+        """Access to rows by number."""
 
 
 def with_index(path: Path, frame: Frame) -> Any:
-    """The frame with ``run`` and ``t`` as columns, where they are levels of its index.
+    """Return the frame with ``run`` and ``t`` as columns if they are levels of its index.
+
+    Args:
+        path: Name of the frame, for messages.
+        frame: Data frame.
 
     Raises:
-        InputError: a column has no name of its own; messages begin with `path`.
+        InputError: The name of a column is not a text, or is not unique.
     """
     whole: Any = frame
     levels = [name for name in whole.index.names if name in ("run", "t")]
@@ -62,27 +67,30 @@ def with_index(path: Path, frame: Frame) -> Any:
 def described(
     path: Path, frame: Frame, declared: Declared, meta: Mapping[str, Any], units: Mapping[str, str]
 ) -> dict[str, Any]:
-    """The description of a frame's columns, as it would stand in `NAME.toml`.
+    """Build the description of a frame's columns, as it would be written in `NAME.toml`.
 
-    A column is the channel or input of its name unless `meta` says otherwise. Its unit is that of
-    `units`, of `meta`, or of ``frame.attrs["units"]``.
+    A column is the channel or input of its name unless `meta` says otherwise. Its unit is taken
+    from `units`, from `meta`, or from ``frame.attrs["units"]``.
 
     Args:
-        path: what messages begin with.
-        frame: with columns as `with_index` gives them.
-        declared: the system, or a simulator of it.
-        meta: what the user states of it, with the keys of `NAME.toml`.
-        units: of columns, by name.
+        path: Name of the frame, for messages.
+        frame: Data frame with columns as returned by `with_index`.
+        declared: System, or simulator of it.
+        meta: Statements of the user, with the keys of `NAME.toml`.
+        units: Units of columns, by name.
+
+    Returns:
+        The complete description.
 
     Raises:
-        InputError: a column belongs to nothing, or a unit is missing.
+        InputError: A column belongs to no signal, or a unit is missing.
     """
     result: dict[str, Any] = _plain(meta)
     poses = afloat(declared)
     usual = {**poses, **{s.name: s.unit for s in (*declared.channels, *declared.inputs)}}
     columns = [name for name in frame.columns if name != "run"]
     for name in units:
-        # One dict of units may serve frames with different columns.
+        # The same dict of units may be used for frames with different columns.
         if name not in columns and name not in usual:
             raise unknown(f"column in units of {path}", name, columns)
     channels = dotted(table(path, "channels", result.get("channels", {})), usual)
@@ -112,7 +120,7 @@ def described(
     _state_unit(time, stamps, units, noted)
     missing = {}
     for name, own in (*channels.items(), *inputs.items(), *extra.items()):
-        # Whatever is no table is refused where the description is checked.
+        # Entries that are not tables are refused when the description is checked.
         if isinstance(own, dict) and not _state_unit(own, _column(name, own), units, noted):
             missing[_column(name, own)] = usual.get(name, "1")
     if missing:
@@ -124,7 +132,7 @@ def described(
 
 
 def _column(name: str, own: Any) -> str:
-    """The column that a signal stands in; what is no table or text is refused elsewhere."""
+    """Return the column of a signal; entries of a wrong type are refused elsewhere."""
     column = own.get("column") if isinstance(own, dict) else None
     return column if isinstance(column, str) else name
 
@@ -132,7 +140,7 @@ def _column(name: str, own: Any) -> str:
 def _state_unit(
     own: dict[str, Any], column: str, units: Mapping[str, str], noted: Mapping[str, Any]
 ) -> bool:
-    """State the unit of a column in its table; returns whether there is one."""
+    """Write the unit of a column into its table, and return whether a unit is known."""
     if column in units:
         own["unit"] = units[column]
     elif "unit" not in own and column in noted:
@@ -141,7 +149,7 @@ def _state_unit(
 
 
 def _plain(value: Any) -> Any:
-    """A copy with dicts, lists and numbers of Python's own, as TOML gives them."""
+    """Copy a value with plain Python dicts, lists and numbers, as TOML gives them."""
     if isinstance(value, Mapping):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -154,7 +162,7 @@ def _names(signals: Iterable[Any]) -> list[str]:
 
 
 def _belongs_to_nothing(path: Path, name: str, declared: Declared) -> InputError:
-    """The error for a column that is neither channel nor input."""
+    """Make the error for a column that is neither channel nor input."""
     channels, inputs = _names(declared.channels), _names(declared.inputs)
     there = f"channels {', '.join(channels)}"
     there += f" and inputs {', '.join(inputs)}" if inputs else " and no inputs"
@@ -167,15 +175,16 @@ def _belongs_to_nothing(path: Path, name: str, declared: Declared) -> InputError
 
 
 def read_frame(path: Path, frame: Frame, about: Description) -> list[TableRun]:
-    """The runs of a frame in order of appearance.
+    """Read the runs of a frame in order of appearance.
 
     Args:
-        path: what messages begin with.
-        frame: with columns as `with_index` gives them; without ``run`` it is one run.
-        about: its description, checked.
+        path: Name of the frame, for messages.
+        frame: Data frame with columns as returned by `with_index`; it is one run if it has no
+            column ``run``.
+        about: Checked description of the frame.
 
     Raises:
-        InputError: anything malformed, in one line.
+        InputError: The frame is malformed; the message is one line.
     """
     sources = about.sources
     if sources.folders or any(source.file for source in sources.signals.values()):
@@ -186,14 +195,19 @@ def read_frame(path: Path, frame: Frame, about: Description) -> list[TableRun]:
 
 
 class _FrameTable(Table):
-    """The table in a frame."""
+    """Table of a recording in a data frame."""
 
     def row(self, record: int) -> str:
-        """Where row `record` (from 0) stands, as a message says it."""
+        """Return the location of row `record` (counted from 0) for a message."""
         return f"{self.path}.iloc[{record}]"
 
     def of(self, frame: Frame, about: Description) -> list[TableRun]:
-        """The runs of a frame."""
+        """Return the runs of a frame.
+
+        Args:
+            frame: Data frame.
+            about: Checked description of the frame.
+        """
         sources = about.sources
         signals = {name: source.column for name, source in sources.signals.items()}
         places = {"t": sources.time, **signals, **{name: name for name in about.extra}}
@@ -209,21 +223,21 @@ class _FrameTable(Table):
         return self.runs(self._run_names(frame, len(columns["t"])), columns)
 
     def _run_names(self, frame: Any, count: int) -> list[str]:
-        """The name of the run of each row."""
+        """Return the name of the run of each row."""
         if "run" not in frame.columns:
             return ["1"] * count
         cells = frame["run"]
         missing = cells.isna().to_numpy()
         if missing.any():
             self.fault(int(np.argmax(missing)), "run", "expected the name of a run, found none")
-        # A column of whole numbers that had gaps once is one of floats.
+        # A column of integers that once had missing cells has the type float.
         whole = cells.dtype.kind == "f"
         return [f"{cell:g}" if whole else str(cell).strip() for cell in cells]
 
     def _values(self, name: str, frame: Any, column: str) -> Array:
-        """A column as numbers; NaN where a cell is missing."""
+        """Return a column as numbers (T,); NaN where a cell is missing."""
         cells = frame[column]
-        if name == "t" and cells.dtype.kind == "M":  # stamps of a clock
+        if name == "t" and cells.dtype.kind == "M":  # absolute time stamps
             cells = cells - cells.min()
         if name == "t" and cells.dtype.kind == "m":
             cells = cells.dt.total_seconds()

@@ -1,7 +1,8 @@
-"""HDF5 files as logs: plain ones as one log, those of robomimic with a group for each run.
+"""Read HDF5 files as logs: a plain file is one log, a robomimic file has one log per run.
 
-A column is named by the path of its dataset, ``obs/joint_pos``; the log of a run is the group as if
-it were a folder, ``demo.hdf5/data/demo_3``. The package h5py is loaded when a file is read.
+A column is named by the path of its dataset, ``obs/joint_pos``. The log of a run is addressed as if
+its group were a folder, ``demo.hdf5/data/demo_3``. The package h5py is imported when a file is
+read.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ _RUN = re.compile(r"[A-Za-z_ -]*\d+")
 
 
 def is_hdf5(path: Path) -> bool:
-    """Return whether a path is that of an HDF5 file, by its ending."""
+    """Return whether a path is an HDF5 file, by its ending."""
     return path.suffix.lower() in ENDINGS and path.is_file()
 
 
 def group_of(path: Path) -> tuple[Path, str] | None:
-    """Return the HDF5 file that a path leads into, and the group there; None if into none."""
+    """Split a path into an HDF5 file and a group in it; None if it is not inside such a file."""
     if is_hdf5(path):
         return path, "/"
     for parent in path.parents:
@@ -40,10 +41,10 @@ def group_of(path: Path) -> tuple[Path, str] | None:
 
 
 def runs_in(path: Path) -> list[Path]:
-    """Return the log of each run of a file: its groups that are numbered, else the file itself.
+    """List the log of each run of a file: its numbered groups, or the file itself.
 
     Raises:
-        InputError: it cannot be read, or h5py is not installed.
+        InputError: The file cannot be read, or h5py is not installed.
     """
     with _opened(path) as file:
         for name in ("", "data"):
@@ -56,10 +57,18 @@ def runs_in(path: Path) -> list[Path]:
 
 
 def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list[str]]]:
-    """Read the numbers of a group by name, (T,) or (T, k), and its texts.
+    """Read the datasets of a group.
+
+    Args:
+        path: HDF5 file.
+        group: Path of the group in it.
+
+    Returns:
+        Numbers by dataset name, (T,) or (T, k), and the texts of each other dataset, empty where it
+        holds something else.
 
     Raises:
-        InputError: there is no such group, or the file cannot be read.
+        InputError: There is no such group, or the file cannot be read.
     """
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
@@ -86,7 +95,7 @@ def read_group(path: Path, group: str) -> tuple[dict[str, Array], dict[str, list
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open an HDF5 file; whatever its reader raises becomes one line."""
+    """Open an HDF5 file, and convert the errors of its reader to one line."""
     try:
         import h5py
     except ImportError:
@@ -98,25 +107,25 @@ def _opened(path: Path) -> Iterator[Any]:
             yield file
     except (InputError, MemoryError, KeyboardInterrupt):
         raise
-    except Exception as error:  # of a file that is spoilt the reader raises what it likes
+    except Exception as error:  # with a damaged file, h5py raises many kinds of errors
         what = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not an HDF5 file that can be read: {what[:200]}") from None
 
 
 def _items(group: Any) -> list[tuple[str, Any]]:
-    """What stands in a group; nothing where there is no group."""
+    """Return the members of a group; empty if it is not a group."""
     return list(group.items()) if hasattr(group, "items") else []
 
 
 def _groups(file: Any) -> list[str]:
-    """Names of the groups of a file, the first ones of many."""
+    """List the names of the first groups of a file."""
     found: list[str] = []
     file.visititems(lambda name, one: found.append(name) if hasattr(one, "items") else None)
     return found[:12]
 
 
 def _texts(dataset: Any) -> list[str]:
-    """The texts of a list of texts; nothing of another dataset."""
+    """Return the texts of a dataset that is a list of texts; empty for another dataset."""
     if dataset.ndim != 1 or dataset.dtype.kind not in "OSU" or dataset.size > WIDEST:
         return []
     return [
@@ -126,6 +135,6 @@ def _texts(dataset: Any) -> list[str]:
 
 
 def _natural(name: str) -> tuple[str, int]:
-    """Order by number where names end in one: ``demo_2`` before ``demo_10``."""
+    """Return a sort key by the number at the end of a name: ``demo_2`` before ``demo_10``."""
     digits = re.search(r"\d+$", name)
     return (name[: digits.start()], int(digits[0])) if digits else (name, 0)

@@ -1,9 +1,10 @@
-"""Datasets of LeRobot as folders of logs: an episode is a log, ``dataset/episode_000003/frames``.
+"""Read LeRobot datasets as folders of logs, one log per episode.
 
-A dataset (versions 2 and 3) has ``meta/info.json`` and ``data/**/*.parquet``: a file for each
-episode, or several in one, told apart by the column ``episode_index``. Numbers of a list are named
-as the dataset names them, ``observation.state.shoulder_pan.pos``, and by place where it does not.
-Images and videos are left alone. (Layout: huggingface/lerobot, docs/source/lerobot-dataset-v3.mdx.)
+The log of an episode is ``dataset/episode_000003/frames``. A dataset (versions 2 and 3) has
+``meta/info.json`` and ``data/**/*.parquet``: one file per episode, or several episodes per file,
+distinguished by the column ``episode_index``. Entries of a list are named as in the dataset,
+``observation.state.shoulder_pan.pos``, or numbered where the dataset has no names. Images and
+videos are not read. (Layout: huggingface/lerobot, docs/source/lerobot-dataset-v3.mdx.)
 """
 
 from __future__ import annotations
@@ -19,19 +20,19 @@ from sims.base import Array, InputError
 from sims.recording.columnar import columns_of, may_hold, unreadable
 
 FRAMES = "frames"
-"""The log of an episode."""
+"""Name of the log of an episode."""
 EPISODE = "episode_index"
-"""The column that says which episode a row is of."""
+"""Name of the column with the number of the episode of each row."""
 _INSIDE = re.compile(r"episode_(?P<number>\d{1,9})/" + FRAMES)
 
 
 def is_dataset(path: Path) -> bool:
-    """Whether this is the folder of a dataset."""
+    """Return whether a path is the folder of a LeRobot dataset."""
     return (path / "meta" / "info.json").is_file() and (path / "data").is_dir()
 
 
 def episode_of(path: Path) -> tuple[Path, int] | None:
-    """The dataset that a path leads into, and the episode there; None where it leads into none."""
+    """Split a path into a dataset and an episode number; None if it is not inside a dataset."""
     if path.exists():
         return None
     dataset = path.parent.parent
@@ -40,19 +41,23 @@ def episode_of(path: Path) -> tuple[Path, int] | None:
 
 
 def episodes(dataset: Path) -> list[Path]:
-    """The log of each episode, in their order.
+    """List the logs of all episodes, ordered by episode number.
 
     Raises:
-        InputError: a file cannot be read, or says no episode.
+        InputError: A file cannot be read, or has no episode numbers.
     """
     return [dataset / f"episode_{number:06d}" / FRAMES for number in sorted(_files(dataset))]
 
 
 def files_of(dataset: Path, episode: int) -> list[Path]:
-    """Where an episode stands.
+    """List the files that hold an episode, after the file ``meta/info.json``.
+
+    Args:
+        dataset: Folder of the dataset.
+        episode: Number of the episode.
 
     Raises:
-        InputError: there is no such episode; else as `episodes`.
+        InputError: There is no such episode, or a file cannot be read.
     """
     there = _files(dataset)
     if episode not in there:
@@ -62,10 +67,17 @@ def files_of(dataset: Path, episode: int) -> list[Path]:
 
 
 def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[str]]:
-    """Numbers of an episode by name, (T,) or (T, k), and the names of what holds none.
+    """Read an episode of a dataset.
+
+    Args:
+        dataset: Folder of the dataset.
+        episode: Number of the episode.
+
+    Returns:
+        Numeric columns by name, (T,) or (T, k), and the names of the columns without numbers.
 
     Raises:
-        InputError: as `files_of`.
+        InputError: There is no such episode, or a file cannot be read.
     """
     import pyarrow
     import pyarrow.parquet as parquet
@@ -74,7 +86,7 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
     parts = []
     for file in files:
         try:
-            # Images in a table are not read for their numbers' sake.
+            # Images stored in the table are not loaded.
             kept = [field.name for field in parquet.read_schema(file) if may_hold(field.type)]
             rows = [(EPISODE, "==", episode)]
             parts.append(parquet.read_table(file, columns=kept, filters=rows))
@@ -93,19 +105,19 @@ def read_episode(dataset: Path, episode: int) -> tuple[dict[str, Array], list[st
 
 
 def _names(about: Path, feature: str) -> list[str]:
-    """What the entries of a feature are called; nothing where that is not said."""
+    """Return the names of the entries of a feature; empty where the dataset states none."""
     try:
         said = json.loads(about.read_text(encoding="utf-8"))["features"][feature]["names"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
-    # Some name the entries by what they are: {"motors": [...]}.
+    # Some datasets group the names by kind: {"motors": [...]}.
     if isinstance(said, dict) and len(said) == 1:
         (said,) = said.values()
     return said if isinstance(said, list) and all(isinstance(one, str) for one in said) else []
 
 
 def _files(dataset: Path) -> dict[int, list[Path]]:
-    """The files of each episode."""
+    """Return the files that hold each episode."""
     files = sorted((dataset / "data").rglob("*.parquet"))
     stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files)
     return _episodes(stamps)
@@ -113,7 +125,11 @@ def _files(dataset: Path) -> dict[int, list[Path]]:
 
 @lru_cache(maxsize=8)
 def _episodes(stamps: tuple[tuple[Path, int, int], ...]) -> dict[int, list[Path]]:
-    """The files of each episode, of files as they were when they changed last."""
+    """Return the files that hold each episode; cached for unchanged files.
+
+    Args:
+        stamps: Path, time of last change (ns) and size (bytes) of each file.
+    """
     import pyarrow
     import pyarrow.parquet as parquet
 

@@ -1,14 +1,14 @@
-"""Calibration files of LeRobot, by which normalised positions become angles.
+"""Read calibration files of LeRobot, which convert normalised positions to angles.
 
 A file has a table for each motor, ``{"elbow_flex": {"id": 3, "drive_mode": 0, "homing_offset": 85,
-"range_min": 820, "range_max": 3110}}``, in counts of the encoder. A dataset has positions x in
--100 to 100 of that range, and those of a gripper in 0 to 100; with the range r = range_max -
-range_min, N = 4096 counts a turn and the zero in the middle of the range, the angle is
+"range_min": 820, "range_max": 3110}}``, in counts of the encoder. In a dataset, a position x is
+-100 to 100 of that range, or 0 to 100 for a gripper. With the range r = range_max - range_min,
+N = 4096 counts per turn and the zero angle in the middle of the range, the angle is
 
     q = s x r / 200 * 360 / (N - 1),            x in -100 to 100                                 (1)
     q = s (x - 50) r / 100 * 360 / (N - 1),     x in 0 to 100                                    (2)
 
-in degrees, where s is -1 if ``drive_mode`` is set. The homing offset is part of the counts already.
+in degrees, where s is -1 if ``drive_mode`` is set. The counts include the homing offset already.
 (Formulas: huggingface/lerobot, src/lerobot/motors/motors_bus.py, ``_normalize``.)
 """
 
@@ -23,14 +23,14 @@ from sims.base import InputError
 from sims.files import require_file
 
 COUNTS = 4096
-"""Counts of one turn of the encoder of a Feetech or Dynamixel servo."""
+"""Encoder counts per turn of a Feetech or Dynamixel servo."""
 LARGEST_FILE = 1_000_000
-"""Maximum number of bytes of a file that is looked at as a calibration."""
+"""Maximum size of a file that is read as a possible calibration, in bytes."""
 _KEYS = ("range_min", "range_max")
 
 
 class MotorRange(NamedTuple):
-    """The calibrated range of one motor, in counts, and whether its sign is turned."""
+    """Calibrated range of one motor in counts, and whether its sign is reversed."""
 
     lowest: float
     highest: float
@@ -38,17 +38,17 @@ class MotorRange(NamedTuple):
 
 
 class AngleScale(NamedTuple):
-    """How a normalised position becomes an angle: ``gain`` times it plus ``offset``."""
+    """Conversion of a normalised position to an angle: ``gain`` * position + ``offset``."""
 
     gain: float
     offset: float
 
 
 def read_calibration(path: Path) -> dict[str, MotorRange]:
-    """Read the ranges of all motors of a calibration file.
+    """Read the ranges of all motors from a calibration file.
 
     Raises:
-        InputError: it is no calibration file of LeRobot, in one line.
+        InputError: The file is not a calibration file of LeRobot; the message is one line.
     """
     require_file(path)
     try:
@@ -74,7 +74,7 @@ def read_calibration(path: Path) -> dict[str, MotorRange]:
 
 
 def find_calibration(folders: Iterable[Path]) -> Path | None:
-    """Return the only calibration file in some folders; None if there is none, or several."""
+    """Return the only calibration file in some folders; None if there is none or more than one."""
     found = []
     for folder in folders:
         if not folder.is_dir():
@@ -91,13 +91,27 @@ def find_calibration(folders: Iterable[Path]) -> Path | None:
 
 
 def motor_of(column: str, motors: Iterable[str]) -> str | None:
-    """Return the motor whose name stands in that of a column; the longest of several."""
+    """Return the motor whose name is part of a column's name; the longest one if several match.
+
+    Args:
+        column: Name of the column.
+        motors: Names of the motors.
+
+    Returns:
+        The name of the motor; None if none matches.
+    """
     named = [motor for motor in motors if motor.lower() in column.lower()]
     return max(named, key=len, default=None)
 
 
 def angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
-    """Return how a normalised position becomes an angle, by (1), or by (2) if it is `from_zero`."""
+    """Return the conversion of a normalised position to an angle in degrees.
+
+    Args:
+        motor: Calibrated range of the motor.
+        from_zero: Whether positions are 0 to 100, equation (2), instead of -100 to 100, equation
+            (1).
+    """
     degrees = 360.0 / (COUNTS - 1) * (motor.highest - motor.lowest)
     sign = -1.0 if motor.reversed else 1.0
     if from_zero:
@@ -106,8 +120,12 @@ def angle_scale(motor: MotorRange, from_zero: bool) -> AngleScale:
 
 
 def range_scale(lowest: float, highest: float, from_zero: bool) -> AngleScale:
-    """Return how a position that is normalised to a range becomes one in the unit of the range:
-    -100 to 100, or 0 to 100 if it is `from_zero`.
+    """Return the conversion of a normalised position to the unit of its range.
+
+    Args:
+        lowest: Lower end of the range.
+        highest: Upper end of the range, in the same unit.
+        from_zero: Whether positions are 0 to 100 instead of -100 to 100.
     """
     width = highest - lowest
     if from_zero:
@@ -116,7 +134,7 @@ def range_scale(lowest: float, highest: float, from_zero: bool) -> AngleScale:
 
 
 def _motors(document: Any) -> Mapping[str, Mapping[str, Any]] | None:
-    """The tables of the motors; None where the document is something else."""
+    """Return the tables of the motors; None if the document is not a calibration."""
     if not isinstance(document, dict) or not document:
         return None
     for own in document.values():

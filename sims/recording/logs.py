@@ -1,8 +1,8 @@
-"""Logs as their loggers wrote them: a table of text of any layout, a NumPy archive, a Parquet, HDF5
-or PyTorch file, a topic of a bag, an episode of a dataset.
+"""Read logs in the formats of their loggers.
 
-A column is named as the log names it, ``positions[2]`` being the third entry of what holds a list
-or a vector in each row. Nothing is unpickled.
+A log is a text table of any layout, a NumPy archive, a Parquet, HDF5 or PyTorch file, a topic of a
+ROS bag, or an episode of a LeRobot dataset. Columns are named as in the log; ``positions[2]`` is
+the third entry of a column that holds a list or a vector in each row. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ FORMATS = (
     ".hdf5",
     ".hdf",
 )
-"""What can be read, by the name's ending."""
+"""File name endings of the files that can be read."""
 LARGEST = 2_000_000_000
-"""Bytes of a file: more would not fit beside what is made of it."""
+"""Maximum size of a file in bytes, because its content must fit into memory."""
 _ENTRY = re.compile(r"(?P<base>.*)\[(?P<place>\d{1,5})\]")
 
 
 class Stamp(NamedTuple):
-    """When a file was read: another one of that name later is another one."""
+    """Version of a file, as a cache key: path, time of last change (ns) and size (bytes)."""
 
     path: Path
     changed: int
@@ -52,19 +52,19 @@ class Stamp(NamedTuple):
 
 @dataclass(frozen=True)
 class Log:
-    """The columns of one file.
+    """Columns of one log.
 
     Attributes:
-        path: of it.
-        columns: by name, (T,) or (T, k) numbers, NaN where missing; what holds no numbers is left
-            out.
-        texts: names of the columns that hold none.
-        rows: which row of the file each row is, for messages.
-        units: by column, where a row of the file states them.
-        unlisted: columns that are left out of `names`, since another one holds the same numbers
-            under the name of their joint.
-        named: whether the file names its columns.
-        first: number of the first of them in the file, for messages.
+        path: Path of the log.
+        columns: Numbers by column name, (T,) or (T, k), NaN where missing; columns without numbers
+            are left out.
+        texts: Names of the columns without numbers.
+        rows: Word for a row in messages, such as "row" or "message".
+        units: Unit of each column for which a row of the file states one.
+        unlisted: Columns that `names` leaves out, because another one holds the same numbers under
+            the name of their joint.
+        named: Whether the file names its columns.
+        first: Number of the first row in the file, for messages.
     """
 
     path: Path
@@ -77,10 +77,10 @@ class Log:
     first: int = 2
 
     def column(self, name: str) -> Array:
-        """(T,) one column, or one entry of a list.
+        """Return one column (T,), or one entry of a column of lists.
 
         Raises:
-            InputError: there is none, in one line.
+            InputError: There is no such column; the message is one line.
         """
         if name in self.columns:
             values = self.columns[name]
@@ -98,7 +98,7 @@ class Log:
         return frozen(values[:, place])
 
     def _entry(self, name: str) -> tuple[str, int | None]:
-        """The column's own name, whatever its case, and the place in its lists."""
+        """Find a column regardless of case, and the index into its lists if the name has one."""
         match = _ENTRY.fullmatch(name)
         for base, place in (
             ((name, None), (match["base"], int(match["place"]))) if match else ((name, None),)
@@ -117,7 +117,7 @@ class Log:
         return InputError(f"{self.path}: unknown column '{name}'; there are: {there}")
 
     def names(self) -> list[str]:
-        """All columns of numbers; those that hold lists by their entries."""
+        """List all numeric columns; columns of lists by their entries."""
         result = []
         for name, values in self.columns.items():
             if name in self.unlisted:
@@ -130,15 +130,15 @@ class Log:
 
 
 def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> Log:
-    """The columns of a log.
+    """Read the columns of a log.
 
     Args:
-        path: of it.
-        wanted: columns that will be asked for: of a bag, which may be larger than the memory, no
-            others are kept if it has these; all where none are given.
+        path: Path of the log.
+        wanted: Columns that will be used; all if empty. Of a bag, which may be larger than the
+            memory, only these are stored if it has all of them.
 
     Raises:
-        InputError: it cannot be read, in one line.
+        InputError: The log cannot be read; the message is one line.
     """
     path = Path(path)
     bag = bags.bag_of(path)
@@ -147,7 +147,7 @@ def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> Log:
         stamp = Stamp(path, about.st_mtime_ns, about.st_size)
         log = _read_topic(stamp, wanted)
         kept = {name.lower() for name in log.columns}
-        # What is missing is to be said with all that there is.
+        # The error for a missing column lists all columns of the log.
         return log if {name.strip().lower() for name in wanted} <= kept else _read_topic(stamp)
     episode = lerobot.episode_of(path)
     if episode is not None:
@@ -174,9 +174,9 @@ def read_log(path: str | Path, wanted: frozenset[str] = frozenset()) -> Log:
 
 @lru_cache(maxsize=8)
 def _read_topic(stamp: Stamp, wanted: frozenset[str] = frozenset()) -> Log:
-    """A topic of a bag, read once."""
+    """Read a topic of a bag; cached by file version."""
     bag = bags.bag_of(stamp.path)
-    assert bag is not None  # it is one that was asked for
+    assert bag is not None  # the caller checked the path
     columns = bags.read_topic(*bag, wanted)
     if (len(columns) < 2 and not wanted) or not columns[bags.TIME].size:
         raise InputError(f"{stamp.path}: expected messages with numbers, found none")
@@ -185,24 +185,24 @@ def _read_topic(stamp: Stamp, wanted: frozenset[str] = frozenset()) -> Log:
 
 @lru_cache(maxsize=8)
 def _read_episode(stamp: Stamp) -> Log:
-    """An episode of a dataset, read once."""
+    """Read an episode of a dataset; cached by file version."""
     episode = lerobot.episode_of(stamp.path)
-    assert episode is not None  # it is one that was asked for
+    assert episode is not None  # the caller checked the path
     columns, texts = lerobot.read_episode(*episode)
     return Log(stamp.path, columns, tuple(texts), "frame")
 
 
 @lru_cache(maxsize=8)
 def _read_group(stamp: Stamp) -> Log:
-    """A group of an HDF5 file, read once."""
+    """Read a group of an HDF5 file; cached by file version."""
     group = hdf5.group_of(stamp.path)
-    assert group is not None  # it is one that was asked for
+    assert group is not None  # the caller checked the path
     return _of_arrays(stamp.path, *hdf5.read_group(*group))
 
 
 @lru_cache(maxsize=8)
 def _read(stamp: Stamp) -> Log:
-    """A log is asked for column by column, and read once."""
+    """Read a log file; cached by file version, because logs are requested column by column."""
     path = stamp.path
     try:
         log = _READERS[path.suffix.lower()](path)
@@ -218,7 +218,7 @@ def _read(stamp: Stamp) -> Log:
 
 
 def _table(path: Path) -> Log:
-    """A table whose layout is found out."""
+    """Read a text table of any layout."""
     table = read_text_table(path)
     return Log(
         path,
@@ -236,12 +236,12 @@ def _table(path: Path) -> Log:
 
 
 def _archive(path: Path) -> Log:
-    """The arrays of a NumPy archive, one row an instant."""
+    """Read the arrays of a NumPy archive, one row per sample."""
     columns: dict[str, Array] = {}
     texts = []
     names: dict[str, list[str]] = {}
     try:
-        # Opened here: what is no archive would be left open by its reader.
+        # Opened here, because numpy does not close a file that is not an archive.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             for name in arrays.files:
                 values = arrays[name]
@@ -254,14 +254,14 @@ def _archive(path: Path) -> Log:
     except (ValueError, EOFError, KeyError, OSError) as error:
         what = " ".join(str(error).split())
         raise InputError(f"{path}: not an archive of arrays of numbers: {what}") from None
-    except Exception as error:  # the reader of the archive raises what it likes
+    except Exception as error:  # numpy raises many kinds of errors
         raise InputError(f"{path}: not a NumPy archive: {type(error).__name__}") from None
     named, unlisted = arrays_by_name(columns, names)
     return Log(path, {**columns, **named}, tuple(texts), "entry", unlisted=unlisted)
 
 
 def _of_arrays(path: Path, columns: dict[str, Array], texts: dict[str, list[str]]) -> Log:
-    """Arrays of a file, named by its lists of names where it has some."""
+    """Make a log of arrays, whose entries are named by lists of names in the file."""
     if not columns:
         raise InputError(f"{path}: expected columns of numbers, found none")
     named, unlisted = arrays_by_name(columns, {name: own for name, own in texts.items() if own})
@@ -269,15 +269,15 @@ def _of_arrays(path: Path, columns: dict[str, Array], texts: dict[str, list[str]
 
 
 def _tensors(path: Path) -> Log:
-    """The tensors of a PyTorch file, one row an instant."""
-    # Loaded here alone: few logs are archives of tensors.
+    """Read the tensors of a PyTorch file, one row per sample."""
+    # Imported here, because few logs are PyTorch files.
     from sims.recording.torch_tensors import read_tensors
 
     return _of_arrays(path, *read_tensors(path))
 
 
 def _parquet(path: Path) -> Log:
-    """The columns of a Parquet file, lists too."""
+    """Read the columns of a Parquet file, including lists."""
     import pyarrow
     import pyarrow.parquet as parquet
 
@@ -302,7 +302,7 @@ _READERS: Mapping[str, Callable[[Path], Log]] = {
 
 
 def logs_in(folder: Path) -> Iterator[Path]:
-    """The logs of a folder, the topics of a bag, the episodes of a dataset, in order of name."""
+    """List the logs of a folder, topics of a bag or episodes of a dataset, ordered by name."""
     if lerobot.is_dataset(folder):
         yield from lerobot.episodes(folder)
         return

@@ -1,5 +1,6 @@
-"""Where the columns of a recording stand in logs that were not written for it: the words `file`,
-`column`, `[time]` and `runs.NAME.folder` of a description.
+"""Map the columns of a recording to raw logs that were not written for simgap.
+
+The mapping is stated by `file`, `column`, `[time]` and `runs.NAME.folder` in a description.
 """
 
 from __future__ import annotations
@@ -19,15 +20,15 @@ from sims.recording.units import scale
 from sims.user_toml import fault, finite, known, read_toml, table, text
 
 TIME = ("offset", "column", "unit", "rate")
-"""What may stand in `[time]`."""
+"""Keys allowed in `[time]`."""
 MAX_REPEATED = 0.05
-"""Maximum share of the stamps of a log that may repeat the one before; their rows are left out."""
+"""Maximum share of a log's stamps that may repeat the previous one; their rows are left out."""
 SAME_INSTANT = 1e-9
-"""Seconds by which stamps of two files may differ and be one."""
+"""Maximum difference of two stamps in different files that count as the same time, in seconds."""
 
 
 class Source(NamedTuple):
-    """Where a signal stands: a file as seen from its run's folder, and a column of it."""
+    """Location of a signal: a file relative to its run's folder, and a column of that file."""
 
     file: str
     column: str
@@ -35,19 +36,20 @@ class Source(NamedTuple):
 
 @dataclass(frozen=True)
 class Sources:
-    """Where all of a recording stands.
+    """Locations of all columns of a recording.
 
     Attributes:
-        signals: of each channel and input.
-        time: the column of stamps, in every file.
-        second: what a stamp's unit is worth, seconds.
-        offset: seconds by which inputs act later than their stamps say.
-        folders: of each run, as seen from the description; none where there is one run.
-        stated: whether any of it is said: else the table is one that was written for simgap.
-        rate: Hz, rows in place of stamps; 0 where the logs have stamps.
-        files: by run, the file of the signals that state none, as seen from the run's folder.
-        is_renaming: whether columns alone are stated, so that the table may be one that was written
-            for simgap, with other names.
+        signals: Location of each channel and input.
+        time: Name of the column of stamps, in every file.
+        second: Factor from the unit of the stamps to seconds.
+        offset: Delay of the inputs relative to their stamps, s.
+        folders: Folder of each run, relative to the description; empty if there is one run.
+        stated: Whether the description states any location; otherwise the table was written for
+            simgap.
+        rate: Sampling rate in Hz of logs without stamps; 0 if the logs have stamps.
+        files: By run, the file of signals without a stated file, relative to the run's folder.
+        is_renaming: Whether only column names are stated, so that the table may be one written for
+            simgap with other names.
     """
 
     signals: Mapping[str, Source]
@@ -64,15 +66,15 @@ class Sources:
 def read_sources(
     path: Path, meta: Mapping[str, Any], columns: Mapping[str, Mapping[str, Any]]
 ) -> Sources:
-    """What a description says of where its columns stand.
+    """Read the locations of all columns from a description.
 
     Args:
-        path: of the description.
-        meta: all of it.
-        columns: the table of each channel and input.
+        path: Path of the description, for messages.
+        meta: Content of the description.
+        columns: Table of each channel and input in the description.
 
     Raises:
-        InputError: it is malformed.
+        InputError: The description is malformed.
     """
     time = table(path, "time", meta.get("time", {}))
     known(f"entry in [time] of {path}", time, TIME)
@@ -114,7 +116,7 @@ def read_sources(
 
 
 def _rate(path: Path, time: Mapping[str, Any]) -> float:
-    """The rate of logs without stamps, Hz; 0 where they have some."""
+    """Return the sampling rate of logs without stamps, Hz; 0 if the logs have stamps."""
     if "rate" not in time:
         return 0.0
     for other in ("column", "unit"):
@@ -130,9 +132,9 @@ def _rate(path: Path, time: Mapping[str, Any]) -> float:
 
 
 def mapped(description: Path) -> list[Path]:
-    """Files that a description leads to beside its table: logs and bags that it maps, its model.
+    """List the files that a description refers to: its table, logs, bags and model file.
 
-    Whatever is malformed leads nowhere: it is refused when the recording is read.
+    Malformed entries are skipped here; they are refused when the recording is read.
     """
     try:
         meta = read_toml(description)
@@ -140,7 +142,7 @@ def mapped(description: Path) -> list[Path]:
         return []
     signals = [_named(meta.get(kind), "file") for kind in ("channels", "inputs", "runs")]
     folders = _named(meta.get("runs"), "folder") or [""]
-    # A signal without a file is in the table of the description's name in each folder.
+    # A signal without a file is in the table that has the description's name, in each folder.
     usual = description.with_suffix(".csv").name
     files = dict.fromkeys([usual, *(name for names in signals for name in names)])
     paths = [description.parent / folder / file for folder in folders for file in files]
@@ -149,7 +151,7 @@ def mapped(description: Path) -> list[Path]:
 
 
 def _named(tables: Any, word: str) -> list[str]:
-    """What a word says in any of some tables, however deep they stand in each other."""
+    """Return the values of a key in nested tables, at any depth."""
     if not isinstance(tables, dict):
         return []
     own = [tables[word]] if isinstance(tables.get(word), str) else []
@@ -163,21 +165,21 @@ def read_logs(
     inputs: Sequence[str],
     linear: frozenset[str],
 ) -> list[TableRun]:
-    """The runs of a recording whose columns stand in logs.
+    """Read the runs of a recording from its logs.
 
-    A run's rows are all instants at which a sensor or an input has a stamp, from the first sample
-    of a sensor to the last: a sensor's cells are empty between its own stamps, and an input has at
-    each what it holds, or what it goes through on its way, there. So nothing is resampled.
+    The rows of a run are all times at which a sensor or an input has a stamp, from the first to the
+    last sample of a sensor. The cells of a sensor are empty between its own stamps; an input has
+    its held or interpolated value at all times. So measurements are not resampled.
 
     Args:
-        path: the table that is meant where a signal has no file.
-        sources: where everything stands.
-        channels: names of what was measured.
-        inputs: names of what was put in.
-        linear: inputs that go straight from sample to sample.
+        path: Table in which signals without a file are found.
+        sources: Location of each signal.
+        channels: Names of the measured signals.
+        inputs: Names of the inputs.
+        linear: Inputs that are interpolated linearly between samples.
 
     Raises:
-        InputError: anything malformed, in one line.
+        InputError: A log is malformed; the message is one line.
     """
     runs = []
     for name, folder in (sources.folders or {"": ""}).items():
@@ -192,7 +194,7 @@ def read_logs(
 
 
 class _Parts:
-    """The files of one folder."""
+    """Logs of one folder."""
 
     def __init__(self, folder: Path, usual: str, sources: Sources, signals: Sequence[str]) -> None:
         self.sources = sources
@@ -207,8 +209,9 @@ class _Parts:
         }
 
     def runs(self, name: str) -> list[tuple[str, Array | None]]:
-        """Names of the runs in these files, each with the rows of it; all rows where there is one
-        run.
+        """Return the names of the runs in these files, each with a mask of its rows.
+
+        The mask is None where all rows belong to one run.
         """
         first = next(iter(self.logs.values()))
         alone = all(log.path == first.path for log in self.logs.values())
@@ -226,9 +229,20 @@ class _Parts:
         inputs: Sequence[str],
         linear: frozenset[str],
     ) -> TableRun:
-        """One run of them."""
+        """Join the logs of one run into a table.
+
+        Args:
+            name: Name of the run.
+            rows: Mask of the run's rows; None for all rows.
+            channels: Names of the measured signals.
+            inputs: Names of the inputs.
+            linear: Inputs that are interpolated linearly between samples.
+
+        Raises:
+            InputError: A log has missing or decreasing stamps, or a signal has no samples.
+        """
         stamps: dict[Path, Array] = {}
-        # Rows of each file; where a stamp repeats the one before, the first row of it is kept.
+        # Rows of each file that are used; of rows with the same stamp, only the first.
         kept: dict[Path, Any] = {}
         notes = []
         for log in self.logs.values():
@@ -241,7 +255,8 @@ class _Parts:
             if not first.all():
                 repeated = f"{int((~first).sum())} of {own.size} stamps repeat the one before"
                 notes.append(f"{log.path}: {repeated}; their {log.rows}s are left out")
-        # Clocks of robots count from 1970: what is left of a second there is too coarse for rates.
+        # Clocks of robots count from 1970: the remaining resolution is too coarse for rates, so
+        # subtract the first stamp.
         zero = min(own[0] for own in stamps.values())
         stamps = {path: self.sources.second * (own - zero) for path, own in stamps.items()}
         measured = np.unique(np.concatenate([stamps[self.logs[c].path] for c in channels]))
@@ -286,7 +301,18 @@ class _Parts:
         kept: Mapping[Path, Any],
         straight: bool,
     ) -> Array:
-        """(T,) an input at all instants."""
+        """Return the values of an input at all times of a run.
+
+        Args:
+            signal: Name of the input.
+            stamps: Stamps of the input's log, s.
+            times: (T,) times of the run, s.
+            kept: Rows of each log that are used.
+            straight: Whether to interpolate linearly instead of holding the last value.
+
+        Returns:
+            (T,) values in the unit of the log.
+        """
         log = self.logs[signal]
         values = self._values(log, signal, kept)
         missing = np.flatnonzero(~np.isfinite(values))
@@ -305,10 +331,10 @@ class _Parts:
     def _stamps(
         self, log: Log, rows: Array | None
     ) -> tuple[Array, np.ndarray[tuple[int, ...], np.dtype[np.bool_]]]:
-        """(T,) the stamps of a file, in their unit, and which of them do not repeat the one before.
+        """Return the stamps (T,) of a log in its own unit, and a mask of the unrepeated ones.
 
         Raises:
-            InputError: a stamp is missing or runs backwards, or many repeat the one before.
+            InputError: A stamp is missing or decreases, or many stamps repeat the previous one.
         """
         if self.sources.rate:
             longest = max(len(values) for values in log.columns.values())

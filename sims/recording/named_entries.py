@@ -1,9 +1,9 @@
-"""Numbers of messages by the names that stand beside them in the same log.
+"""Name the numbers of a log by the names of joints in the same log.
 
-A message of joint states has a list of names and lists of numbers in the same order, which need not
-be the order of the model: drivers of ROS sort names by the alphabet. Logs keep the names as columns
-(``field.name0`` beside ``field.position0`` of ``rostopic echo -p``), as a text in each row
-(``['base', 'elbow']``), or as an array of texts (NumPy). A number is then called by its name:
+A message of joint states has a list of names and lists of numbers in the same order, which may
+differ from the order of the model: ROS drivers sort names alphabetically. Logs store the names as
+columns (``field.name0`` next to ``field.position0`` of ``rostopic echo -p``), as a text in each row
+(``['base', 'elbow']``), or as an array of texts (NumPy). A number then gets the name of its joint:
 ``field.position.base``.
 """
 
@@ -27,14 +27,14 @@ def entries_by_name(
 ) -> tuple[dict[str, Array], frozenset[str]]:
     """Name the numbered columns of a table by the columns that hold their names.
 
-    Names are looked up row by row, since some loggers change their order.
+    Names are looked up in each row, because some loggers change their order.
 
     Args:
-        columns: (T,) numbers by name.
-        texts: (T,) texts by name.
+        columns: Numbers (T,) by column name.
+        texts: Texts (T,) by column name.
 
     Returns:
-        The numbers by their joints' names, and the numbered columns that they replace.
+        The numbers by the names of their joints, and the numbered columns that they replace.
     """
     groups: dict[tuple[str, str, str], dict[int, str]] = {}
     for column in texts:
@@ -65,11 +65,11 @@ def lists_by_name(
     """Name the entries of lists by a column that holds a list of names in each row.
 
     Args:
-        columns: (T,) or (T, k) numbers by name.
-        texts: (T,) texts by name.
+        columns: Numbers (T,) or (T, k) by column name.
+        texts: Texts (T,) by column name.
 
     Returns:
-        The numbers by their joints' names, and the lists that they replace.
+        The numbers by the names of their joints, and the lists that they replace.
     """
     named: dict[str, Array] = {}
     unlisted: set[str] = set()
@@ -94,11 +94,11 @@ def arrays_by_name(
     """Name the entries of arrays by an array of names of the same length.
 
     Args:
-        columns: (T,) or (T, k) numbers by name.
-        names: (k,) texts by the name of their array.
+        columns: Numbers (T,) or (T, k) by array name.
+        names: Texts (k,) by array name.
 
     Returns:
-        The numbers by their joints' names, and the arrays that they replace.
+        The numbers by the names of their joints, and the arrays that they replace.
     """
     named: dict[str, Array] = {}
     unlisted: set[str] = set()
@@ -115,7 +115,17 @@ def arrays_by_name(
 def _numbered(
     columns: Mapping[str, Array], prefix: str, left: str, right: str
 ) -> dict[str, dict[int, str]]:
-    """Numbered columns by what stands before the number, each with its place."""
+    """Group numbered columns by the text before their number.
+
+    Args:
+        columns: Numbers by column name.
+        prefix: Required beginning of the names.
+        left: Required character before the number.
+        right: Required character after the number.
+
+    Returns:
+        Column names by number, for each text before the number.
+    """
     found: dict[str, dict[int, str]] = {}
     for column, values in columns.items():
         match = _PLACED.fullmatch(column)
@@ -127,12 +137,15 @@ def _numbered(
 
 
 def _by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) -> dict[str, Array]:
-    """Numbers by name, names being looked up in every row; nothing where a row has one twice.
+    """Sort numbers into columns by name, looking up the names in each row.
 
     Args:
-        values: (T, k) numbers.
-        names: (k, T) the name of each in each row.
-        prefix: what the columns' names begin with.
+        values: Numbers (T, k).
+        names: Names (k, T), one for each number in each row.
+        prefix: Beginning of the names of the new columns.
+
+    Returns:
+        Columns (T,) by name, NaN in rows without the name; empty if a row has a name twice.
     """
     every = list(dict.fromkeys(name for own in names for name in own if name))
     if not every or len(every) > 4 * len(names):
@@ -153,7 +166,7 @@ def _by_name(values: Array, names: Sequence[Sequence[str]], prefix: str) -> dict
 
 
 def _texts_of(cell: str) -> list[str]:
-    """The texts of a list that is written in a cell, as ``['base', 'elbow']``."""
+    """Return the texts of a list that is written in a cell as ``['base', 'elbow']``."""
     match = _LIST_OF_TEXTS.fullmatch(cell.strip())
     if not match:
         return []

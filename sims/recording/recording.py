@@ -1,9 +1,9 @@
-"""Measured data: a table `NAME.csv` and its description `NAME.toml`, read and checked, never
-guessed, never written.
+"""Recordings: a table `NAME.csv` and its description `NAME.toml`, read and checked.
 
 The table has the columns `run`, `t` (seconds, increasing within a run) and one for each channel and
-input, in the units that the description states; an empty cell is a missing sample. What is read is
-in SI units. Every fault found gives one line: file, row, column, what was expected, what was found.
+input, in the units that the description states; an empty cell is a missing sample. Values are
+converted to SI units. Nothing is guessed, and the files are not changed. Every error is one line:
+file, row, column, what was expected, what was found.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ Mask = NDArray[np.bool_]
 Number = TypeVar("Number", bound=np.generic)
 
 REMEMBERED = 2.0
-"""Seconds before a part of a run of which its inputs are kept: what lags, limits of the rate and
-motion profiles know of them is over by then.
+"""Input history stored with a part of a run, in seconds.
+
+Delays, rate limits and motion profiles do not depend on earlier inputs.
 """
 
 
@@ -52,23 +53,23 @@ class Run:
     """One run of a recording.
 
     Attributes:
-        name: as in the `run` column.
-        times: (T,) seconds.
-        channels: measured signals by name, each (T,), SI units, NaN where missing.
-        inputs: input signals by name, each (T,), SI units.
-        constants: constants that this run states for itself.
-        initial: known initial state.
-        held_out: for measuring only, never for fitting.
-        extra: columns that no channel or input of the system is, each (T,), in the units they are
-            written in.
-        linear: inputs that go straight from one sample to the next; the others hold.
-        offset: seconds by which inputs act later than their stamps say.
-        log: that it is of, where several recordings were joined.
-        fold: number of the cross-validation fold that leaves this run out and predicts it; None
-            where no cross-validation is made.
-        before: of a part of a run, inputs before it, as in `Scenario`.
-        off: whether actuators of a robot are switched off, each (T,), by name.
-        memory: seconds before a part of this run of which its inputs are kept.
+        name: Name, as in the `run` column.
+        times: (T,) sample times, s.
+        channels: Measured signals by name, each (T,), SI units, NaN where missing.
+        inputs: Input signals by name, each (T,), SI units.
+        constants: Constants stated for this run alone, SI units.
+        initial: Known initial state, SI units.
+        held_out: Whether the run is used for validation only, never for fitting.
+        extra: Columns that are neither channel nor input of the system, each (T,), in the units in
+            which they are written.
+        linear: Inputs that are interpolated linearly between samples; the others are held.
+        offset: Delay of the inputs relative to their stamps, s.
+        log: Name of the log that the run is from, if several recordings were joined.
+        fold: Number of the cross-validation fold that leaves this run out and predicts it; None
+            without cross-validation.
+        before: Inputs before the start of a part of a run, as in `Scenario`.
+        off: Whether actuators of a robot are switched off, each (T,), by name.
+        memory: Length of the input history that is stored with a part of this run, s.
     """
 
     name: str
@@ -88,7 +89,7 @@ class Run:
     memory: float = REMEMBERED
 
     def __repr__(self) -> str:
-        # A cell of a notebook that ends in a run would print all of its samples.
+        # Without this, a notebook cell that ends in a run would print all of its samples.
         seconds = self.times[-1] - self.times[0] if self.times.size else 0.0
         use = "held out" if self.held_out else "for fitting"
         if self.fold is not None:
@@ -96,7 +97,12 @@ class Run:
         return f"<run {self.name}: {self.times.size} samples, {seconds:.4g} s, {use}>"
 
     def part(self, rows: slice, name: str = "") -> Run:
-        """Some of its samples as a run; of another name where one is given."""
+        """Return a part of the run as a run of its own.
+
+        Args:
+            rows: Samples of the part.
+            name: Name of the part; that of the run if empty.
+        """
 
         def cut(signals: Mapping[str, NDArray[Number]]) -> dict[str, NDArray[Number]]:
             return {key: values[rows] for key, values in signals.items()}
@@ -107,7 +113,7 @@ class Run:
             times=self.times[rows],
             channels=cut(self.channels),
             inputs=cut(self.inputs),
-            # a known initial state is that of the whole run's beginning
+            # The known initial state belongs to the first sample of the whole run.
             initial={} if rows.start else self.initial,
             extra=cut(self.extra),
             off=cut(self.off),
@@ -115,7 +121,15 @@ class Run:
         )
 
     def _before(self, name: str, row: int) -> Array:
-        """(2, K) an input in the last seconds before a sample, from there on."""
+        """Return the stored history of an input before a sample.
+
+        Args:
+            name: Name of the input.
+            row: Number of the sample.
+
+        Returns:
+            (2, K) times relative to the sample (s, negative) and values.
+        """
         earlier = self.before.get(name, np.empty((2, 0)))
         stamps = np.concatenate([earlier[0] + self.times[0], self.times[:row]]) - self.times[row]
         known = np.stack([stamps, np.concatenate([earlier[1], self.inputs[name][:row]])])
@@ -124,12 +138,20 @@ class Run:
 
 @dataclass(frozen=True, repr=False)
 class Recording:
-    """A recording: the system it is of, its constants, each channel's noise where stated (1 sigma),
-    its runs.
+    """Recording of a system, in SI units.
 
-    `extra` has the units of the columns that belong to no channel or input, such as pixels of a
-    tracked film; `model` the model file where it is of a robot; `notes` say how its logs were read,
-    such as samples that were left out, or in which drives are off.
+    Attributes:
+        path: Path of the table.
+        system: Name of the recorded system.
+        title: Title in one line.
+        constants: Known constants, SI units.
+        noise: Standard deviation of each channel's noise where stated, SI units.
+        runs: All runs, in order.
+        extra: Units of the columns that belong to no channel or input, such as pixels of a tracked
+            film.
+        model: Model file, if the system is a robot.
+        notes: Remarks on how the logs were read, such as samples that were left out, or times in
+            which drives are off.
     """
 
     path: Path
@@ -151,11 +173,11 @@ class Recording:
         return f"<recording {self.path.name}: {self.system}, {runs}, channels {channels}>"
 
     def training(self) -> tuple[Run, ...]:
-        """Runs for fitting."""
+        """Return the runs for fitting."""
         return tuple(run for run in self.runs if not run.held_out)
 
     def held_out(self) -> tuple[Run, ...]:
-        """Runs for measuring."""
+        """Return the held-out runs, which are used for validation only."""
         return tuple(run for run in self.runs if run.held_out)
 
     def folds(self) -> tuple[int, ...]:
@@ -166,19 +188,19 @@ class Recording:
 def read_recording(
     path: str | Path, declared: Declared, whole: bool = False, folds: bool = False
 ) -> Recording:
-    """Read `NAME.csv` and `NAME.toml` and check them against a system's channels, inputs, constants
-    and states.
+    """Read `NAME.csv` and `NAME.toml` and check them against a system.
+
+    Channels, inputs, constants and states must be those of the system.
 
     Args:
-        path: the table.
-        declared: the system, or a simulator of it; `system_of` says which system the recording
-            states.
-        whole: hold nothing out but the runs that are marked, and do not divide a single run.
-        folds: number two or three unmarked runs as cross-validation folds instead of holding one
-            of them out.
+        path: Path of the table.
+        declared: System, or simulator of it; `system_of` reads which system the recording states.
+        whole: Whether to hold out only the marked runs, and not to split a single run.
+        folds: Whether to number two or three unmarked runs as cross-validation folds instead of
+            holding one of them out.
 
     Raises:
-        InputError: anything malformed, in one line.
+        InputError: The recording is malformed; the message is one line.
     """
     table = Path(path)
     description, meta = read_meta(table)
@@ -216,7 +238,18 @@ def _read_renamed(
     inputs: Sequence[str],
     extra: Sequence[str],
 ) -> list[TableRun]:
-    """Read a table whose columns have other names than the signals, as the description says."""
+    """Read a table whose columns are renamed by the description.
+
+    Args:
+        path: Path of the table.
+        sources: Column of each signal.
+        channels: Names of the channels.
+        inputs: Names of the inputs.
+        extra: Names of the other columns.
+
+    Returns:
+        The runs, with columns by the names of the signals.
+    """
     columns = {name: sources.signals[name].column for name in (*channels, *inputs)}
     parts = []
     recorded = [columns[name] for name in channels], [columns[name] for name in inputs]
@@ -234,18 +267,21 @@ def recording_of_frame(
     units: Mapping[str, str],
     name: str = "DataFrame",
 ) -> Recording:
-    """A recording in a data frame, checked as `read_recording` checks files; nothing is held out
-    but the runs that are marked.
+    """Make a recording from a data frame, checked as `read_recording` checks files.
+
+    Only the marked runs are held out.
 
     Args:
-        frame: columns ``run`` (where there are several), ``t`` and one for each channel and input.
-        declared: the system, or a simulator of it.
-        meta: its description, with the keys of `NAME.toml`.
-        units: of columns, by name; else those of `meta` and of ``frame.attrs["units"]``.
-        name: what messages call it.
+        frame: Data frame with columns ``run`` (for several runs), ``t`` and one for each channel
+            and input.
+        declared: System, or simulator of it.
+        meta: Description of the frame, with the keys of `NAME.toml`.
+        units: Units of columns by name; missing ones are taken from `meta` and
+            ``frame.attrs["units"]``.
+        name: Name of the frame in messages.
 
     Raises:
-        InputError: anything malformed, in one line.
+        InputError: The frame is malformed; the message is one line.
     """
     path = Path(name)
     whole = with_index(path, frame)
@@ -268,17 +304,17 @@ def recording_of_frame(
 
 
 def divided(recording: Recording, folds: bool = False) -> Recording:
-    """Return the recording with its runs divided for fitting and validation, as by
-    `read_recording`: marked runs are held out, else every third run, else the last third of a
-    single run.
+    """Divide the runs of a recording into runs for fitting and held-out runs.
+
+    Marked runs are held out; without marks every third run, or the last third of a single run.
 
     Args:
-        recording: as it was read.
-        folds: number two or three unmarked runs as cross-validation folds instead of holding one
-            of them out.
+        recording: Recording with its marks.
+        folds: Whether to number two or three unmarked runs as cross-validation folds instead of
+            holding one of them out.
 
     Raises:
-        InputError: all runs are held out, or a single one is too short to be divided.
+        InputError: All runs are held out, or a single run is too short to be divided.
     """
     path = recording.path
     description = path.with_suffix(".toml") if path.suffix == ".csv" else path
@@ -286,21 +322,21 @@ def divided(recording: Recording, folds: bool = False) -> Recording:
 
 
 MAX_FOLDS = 3
-"""Largest number of unmarked runs that are cross-validated: with more, every third is held out."""
+"""Maximum number of unmarked runs for cross-validation; of more, every third is held out."""
 _UNMARKED = RunMarks({}, {}, None)
-"""What is said of a run that the description does not mention."""
+"""Metadata of a run that the description does not mention."""
 _THIRD = 3
-"""Of the runs, or of a single one's samples, one in so many is held out."""
+"""Every third run, or the last third of the samples of a single run, is held out."""
 
 
 def _run(table: Path, part: TableRun, about: Description) -> Run:
-    """A run in SI units, with what the description says of it."""
+    """Make a run in SI units from its table and the metadata of the description."""
     marks = about.runs.get(part.name, _UNMARKED)
     channels = {n: _converted(table, part, n, s) for n, s in about.channels.items()}
     inputs = {n: _converted(table, part, n, s) for n, s in about.inputs.items()}
     for name, command in about.wrapped.items():
         channels[name] = frozen(unwrapped(channels[name], inputs.get(command)))
-    # no system reads them, so they keep their unit; of logs nobody has asked for any
+    # Extra columns keep their unit, because no system reads them; runs read from logs have none.
     extra = {name: part.columns[name] for name in about.extra if name in part.columns}
     first = {n: s.gain * extra[n][0] + s.offset for n, s in about.begins.items() if n in extra}
     begins = {name: float(value) for name, value in first.items() if np.isfinite(value)}
@@ -319,15 +355,15 @@ def _run(table: Path, part: TableRun, about: Description) -> Run:
 
 
 def _converted(table: Path, part: TableRun, name: str, scale: Scale) -> Array:
-    """One column in SI units.
+    """Convert a column to SI units.
 
     Raises:
-        InputError: a value is too large for that.
+        InputError: A value is too large for that.
     """
     values = part.columns[name]
     if scale == SAME:
         return values
-    # reported below with its place, which a warning would not have
+    # An overflow is reported below with the name of its column, which a warning would not have.
     with np.errstate(over="ignore"):
         result = values * scale.gain + scale.offset
     if np.isinf(result).any():
@@ -339,7 +375,7 @@ def _converted(table: Path, part: TableRun, name: str, scale: Scale) -> Array:
 
 
 def _split(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
-    """Divide the runs for fitting and validation; see `divided`."""
+    """Divide the runs into runs for fitting and held-out runs, as described for `divided`."""
     runs = [replace(run, fold=None) for run in runs]
     if any(run.held_out for run in runs):
         if all(run.held_out for run in runs):
@@ -352,13 +388,14 @@ def _split(path: Path, runs: Sequence[Run], folds: bool) -> tuple[Run, ...]:
         return _halves(path, runs[0])
     if folds and len(runs) <= MAX_FOLDS:
         return tuple(replace(run, fold=number) for number, run in enumerate(runs))
-    # the last of each three, so that early and late runs are fitted; of two the second
+    # Hold out the last of every three runs, so that early and late ones are fitted; of two, the
+    # second.
     marked = [i % _THIRD == _THIRD - 1 or (len(runs) == 2 and i == 1) for i in range(len(runs))]
     return tuple(replace(run, held_out=mark) for run, mark in zip(runs, marked, strict=True))
 
 
 def _halves(path: Path, run: Run) -> tuple[Run, ...]:
-    """A run's beginning, and its last third held out."""
+    """Split a run into its first two thirds and its last third, which is held out."""
     count = len(run.times)
     cut = (2 * count) // _THIRD
     parts = (

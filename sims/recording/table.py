@@ -1,6 +1,6 @@
-"""The table of a recording, `NAME.csv`: read cell by cell, every fault with its row and column.
+"""Read the table `NAME.csv` of a recording cell by cell; errors state row and column.
 
-Rows are lines of the file, counted from 1 with the header, as an editor shows them.
+Rows are lines of the file, counted from 1 with the header, as in an editor.
 """
 
 from __future__ import annotations
@@ -23,16 +23,21 @@ from sims.recording.fast import WORTHWHILE, read_fast
 from sims.user_toml import shown
 
 _CHUNK = 1 << 13
-"""Rows that are turned into numbers at once; memory for text is what they cost."""
+"""Number of rows that are converted to numbers at once, which limits the memory for their text."""
 _YEAR = 365.25 * 86400
-"""Seconds."""
+"""Seconds per year."""
 _NUMBER = re.compile(r"\s*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?\s*")
-"""A number as instruments write it; what float() takes besides, `inf` or `1_000`, is a mistake."""
+"""Pattern of a number as instruments write it, without `inf` or `1_000`, which float() accepts."""
 
 
 class TableRun(NamedTuple):
-    """The rows of one run: its name, times (T,), and the other columns by name, each (T,); NaN
-    where missing. `notes` say what was left out of its files.
+    """Rows of one run.
+
+    Attributes:
+        name: Name of the run.
+        times: (T,) times, in the unit of the table.
+        columns: Other columns by name, each (T,); NaN where missing.
+        notes: Remarks on rows that were left out.
     """
 
     name: str
@@ -44,11 +49,16 @@ class TableRun(NamedTuple):
 def read_table(
     path: Path, channels: Sequence[str], inputs: Sequence[str], extra: Sequence[str] = ()
 ) -> list[TableRun]:
-    """The runs of a table in order of appearance. A channel's or extra cell may be empty; an
-    input's may not.
+    """Read the runs of a table in order of appearance.
+
+    Args:
+        path: Path of the table.
+        channels: Names of the measured signals; cells may be empty.
+        inputs: Names of the inputs; no cell may be empty.
+        extra: Names of other columns; cells may be empty.
 
     Raises:
-        InputError: anything malformed, in one line.
+        InputError: The table is malformed; the message is one line.
     """
     require_file(path)
     try:
@@ -69,7 +79,7 @@ def has_run_column(path: Path) -> bool:
 
 
 def _not_text(path: Path) -> InputError:
-    """What is wrong with a table that is no UTF-8."""
+    """Make the error for a table that is not UTF-8."""
     data = path.read_bytes()
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return InputError(f"{path}: expected UTF-8 text, found UTF-16; save it as UTF-8")
@@ -84,13 +94,13 @@ def _not_text(path: Path) -> InputError:
 
 
 class Table:
-    """The table of a CSV file; what its rows must be holds of every table (`runs`).
+    """Table of a CSV file, and the checks of runs that apply to every kind of table (`runs`).
 
     Args:
-        path: what messages begin with.
-        channels: names of what was measured; a cell may be empty.
-        inputs: names of what was put in; no cell may be empty.
-        extra: names of other columns; a cell may be empty.
+        path: Path of the table, for messages.
+        channels: Names of the measured signals; cells may be empty.
+        inputs: Names of the inputs; no cell may be empty.
+        extra: Names of other columns; cells may be empty.
     """
 
     def __init__(
@@ -102,20 +112,20 @@ class Table:
         self.channels, self.inputs = channels, inputs
 
     def read(self) -> list[TableRun]:
-        """The runs of the file."""
+        """Return the runs of the file."""
         records = self._records()
         header = self._header(next(records, []))
         quick = None
         if self.path.stat().st_size >= WORTHWHILE:
             quick = read_fast(self.path, header, self.wanted[1:], self.gaps)
-        # whatever the fast reader did not like is looked at cell by cell, and gets its message
+        # If the fast reader gives up, read cell by cell to locate the error.
         names, columns = quick or self._cells(header, records)
         return self.runs(names, columns)
 
     def _cells(
         self, header: list[str], records: Iterator[list[str]]
     ) -> tuple[list[str], dict[str, Array]]:
-        """Run names row by row, and the other columns, from the rows behind the header."""
+        """Convert the rows below the header to run names and numeric columns (T,)."""
         names: list[str] = []
         parts: list[list[Array]] = []
         while rows := list(islice(records, _CHUNK)):
@@ -131,7 +141,7 @@ class Table:
         return names, dict(zip(numeric, columns, strict=True))
 
     def _records(self) -> Iterator[list[str]]:
-        """Header and rows; blank lines are passed over."""
+        """Iterate over header and rows; skip blank lines."""
         with self.path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True, skipinitialspace=True)
             try:
@@ -142,9 +152,9 @@ class Table:
                 ) from None
 
     def _header(self, cells: list[str]) -> list[str]:
-        """The columns' names, checked against what was declared."""
+        """Check the names of the columns against the declared ones, and return them."""
         header = [cell.strip() for cell in cells]
-        # the likeliest reason for one column is another separator
+        # A single column is most likely due to another separator.
         if len(header) < 2:
             text = "".join(header)
             marks = [name for mark, name in ((";", "semicolons"), ("\t", "tabs")) if mark in text]
@@ -170,8 +180,12 @@ class Table:
         return header
 
     def _even(self, rows: list[list[str]], width: int, first: int) -> list[list[str]]:
-        """The rows, each checked to have as many cells as the header; `first` is the number of the
-        first.
+        """Check that all rows have as many cells as the header, and return them.
+
+        Args:
+            rows: Cells of each row.
+            width: Number of cells of the header.
+            first: Number of the first of these rows, counted from 0.
         """
         if set(map(len, rows)) != {width}:
             record, row = next((i, row) for i, row in enumerate(rows) if len(row) != width)
@@ -182,14 +196,20 @@ class Table:
         return rows
 
     def _numbers(self, name: str, cells: Sequence[str], first: int) -> Array:
-        """One column's cells as numbers; an empty cell is NaN where the column may have gaps."""
+        """Convert the cells of a column to numbers (T,); empty ones to NaN where gaps are allowed.
+
+        Args:
+            name: Name of the column.
+            cells: Text of each cell.
+            first: Number of the first of these rows, counted from 0.
+        """
         try:
             values = np.array(list(map(float, cells)))
         except ValueError:
             values = np.array([float(c) if _NUMBER.fullmatch(c) else math.nan for c in cells])
         suspects: Iterable[int] = np.flatnonzero(~np.isfinite(values)).tolist()
         joined = "".join(cells)
-        # float() takes 1_000 and the digits of other scripts
+        # float() also accepts 1_000 and digits of other scripts.
         if "_" in joined or not joined.isascii():
             suspects = range(len(cells))
         for i in suspects:
@@ -204,14 +224,15 @@ class Table:
             self.fault(record, name, f"expected a finite number, found {shown(cell)}{more}")
 
     def runs(self, names: list[str], columns: dict[str, Array]) -> list[TableRun]:
-        """The runs, each a stretch of rows of one name.
+        """Split the rows into runs, each a block of rows with the same name, and check them.
 
         Args:
-            names: of the run of each row.
-            columns: times ``t`` and all other columns by name; NaN where a cell is empty.
+            names: Name of the run of each row.
+            columns: Times ``t`` and all other columns by name, each (T,); NaN where a cell is
+                empty.
 
         Raises:
-            InputError: there are no rows; a run has no name, too few rows or no sample; or time
+            InputError: There are no rows; a run has no name, too few rows or no sample; or time
                 does not increase.
         """
         if not names:
@@ -247,7 +268,7 @@ class Table:
         return list(runs.values())
 
     def _seconds(self, t: Array, first: int, last: int) -> None:
-        """Check that a run's stamps can be seconds: those of a clock in milliseconds cannot."""
+        """Check that the stamps of a run can be seconds, and not milliseconds."""
         latest = max(-t[first], t[last])
         if latest > LATEST:
             years = f"{latest:.4g}, which would be {latest / _YEAR:.2g} years"
@@ -259,9 +280,14 @@ class Table:
             self.fault(last, "t", f"expected seconds, found a run of {lasts:.3g} s")
 
     def _increasing(self, t: Array, edges: list[int]) -> None:
-        """Check the times between edges."""
+        """Check that the times increase within each run.
+
+        Args:
+            t: (T,) times.
+            edges: First row of each run, and the number of rows.
+        """
         bad = t[1:] <= t[:-1]
-        # a run may begin earlier than the one before ended
+        # A run may begin earlier than the previous one ended.
         begins = np.array(edges[1:-1], dtype=int)
         bad[begins - 1] = False
         if bad.any():
@@ -269,24 +295,33 @@ class Table:
             self.fault(i + 1, "t", f"expected more than {t[i]:.12g} s, found {t[i + 1]:.12g} s")
 
     def fault(self, record: int, column: str, message: str) -> NoReturn:
-        """Refuse a cell."""
+        """Raise the error for a cell.
+
+        Args:
+            record: Number of the row, counted from 0.
+            column: Name of the column.
+            message: Expected and found content of the cell.
+
+        Raises:
+            InputError: Always.
+        """
         raise InputError(f"{self.row(record)}, column {column}: {message}")
 
     def row(self, record: int) -> str:
-        """Where row `record` (from 0) stands, as a message says it."""
+        """Return the location of row `record` (counted from 0) for a message."""
         return f"{self.path}, row {self._line(record)}"
 
     def _line(self, record: int) -> int:
-        """The line on which row `record` (from 0) ends: read again, as only a fault asks for it."""
+        """Return the line on which row `record` (counted from 0) ends; reads the file again."""
         with self.path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True, skipinitialspace=True)
-            with suppress(csv.Error):  # what the fast reader took, such as an endless cell
+            with suppress(csv.Error):  # the fast reader accepts such cells
                 next(islice((row for row in reader if row), record + 1, None))
             return reader.line_num
 
 
 def _listed(names: Sequence[str], most: int = 12) -> str:
-    """Names for a message, the first few of many."""
+    """Join names for a message; only the first `most` of many."""
     text = ", ".join(names[:most])
     if len(names) > most:
         text += f" and {len(names) - most} more"

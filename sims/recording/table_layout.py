@@ -1,8 +1,8 @@
-"""The layout of a table of text, found from its first lines.
+"""Find the layout of a text table from its first lines.
 
-There may be comments and notes above the header, the header itself may be a comment (as NumPy
-writes it), and a row of units may stand below it. The separator is the one that makes numbers of
-the largest share of the cells.
+Comments and notes may precede the header, the header may be a comment itself (as NumPy writes it),
+and a row of units may follow it. The separator is the one with which the largest share of the cells
+are numbers.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ from sims.recording.unit_names import read_unit
 from sims.user_toml import shown
 
 SEPARATORS = (",", ";", "\t", "|", " ")
-"""Characters between the cells of a table; a blank stands for any number of blanks."""
+"""Possible separators of the cells of a table; a blank means any number of blanks."""
 _HEAD_BYTES = 1 << 22
 """Maximum number of bytes from which the layout is found."""
 _HEAD_LINES = 400
 """Maximum number of lines from which the layout is found."""
 COMMENT = re.compile(r"\s*(#+|%+|//+|!+)\s*")
-"""The beginning of a line that is a comment."""
+"""Pattern of the beginning of a comment line."""
 NUMBER = re.compile(
     r"[+-]?(\d+([.,]\d+)*\.?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE
 )
-"""A number with a decimal point or comma."""
+"""Pattern of a number with a decimal point or comma."""
 NUMBERS = re.compile(r"[\[\(](?P<inside>[^\]\)]*)[\]\)]")
-"""A list of numbers in one cell."""
+"""Pattern of a list of numbers in one cell."""
 INSTANT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d{1,9})?\s*(Z|UTC|[+-]\d\d:?\d\d)?")
-"""A date with its time of day, by ISO 8601."""
+"""Pattern of a date with a time, in ISO 8601."""
 NO_NUMBER = frozenset({"nan", "null", "none", "na", "n/a", "#n/a", "nil"})
-"""Cells that say that there is no number."""
+"""Cells that stand for a missing number."""
 _NAME = re.compile(r"[^\W\d][\w./\[\](){}°%-]*")
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the cells of a table stand in its file.
+    """Layout of a text table.
 
     Attributes:
-        encoding: of the text.
-        separator: one of `SEPARATORS`.
-        names: of the columns; empty where the file names none.
-        units: by column, of the row of units below the header.
-        header: line of the header, counted from 1; 0 where there is none.
-        first: line of the first row of data, counted from 1.
-        width: number of cells of a row.
+        encoding: Encoding of the text.
+        separator: One of `SEPARATORS`.
+        names: Names of the columns; empty if the file has none.
+        units: Unit of each column, from the row of units below the header.
+        header: Line of the header, counted from 1; 0 if there is none.
+        first: Line of the first data row, counted from 1.
+        width: Number of cells per row.
     """
 
     encoding: str
@@ -68,7 +68,7 @@ def find_layout(path: Path) -> Layout:
     """Find the layout of a table from its first lines.
 
     Raises:
-        InputError: there are no rows, or the header has another number of cells than the rows.
+        InputError: The table has no rows, or its header has another number of cells than its rows.
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
@@ -76,7 +76,7 @@ def find_layout(path: Path) -> Layout:
     encoding = _encoding(path, head)
     lines = head.decode(encoding, errors="replace").splitlines()
     if not whole and len(lines) > 1:
-        lines.pop()  # the last line was cut off by the number of bytes
+        lines.pop()  # the last line is incomplete
     lines = lines[:_HEAD_LINES]
     if not any(line.strip() for line in lines):
         raise InputError(f"{path}: expected a table with a header and rows, found an empty file")
@@ -112,13 +112,13 @@ def find_layout(path: Path) -> Layout:
 
 
 def _encoding(path: Path, head: bytes) -> str:
-    """The encoding of a text: UTF-8, UTF-16 with its mark, or that of Windows in the West."""
+    """Return the encoding of a text: UTF-8, UTF-16 with a byte order mark, or Windows-1252."""
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16"
     if b"\0" in head:
         raise InputError(f"{path}: expected a table of text, found binary data")
     try:
-        # What the number of bytes cuts in two at the end is no fault of the file.
+        # Ignore the last line, which may be cut within a character.
         head[: head.rfind(b"\n") + 1 or None].decode("utf-8-sig")
     except UnicodeDecodeError:
         return "cp1252"
@@ -126,17 +126,17 @@ def _encoding(path: Path, head: bytes) -> str:
 
 
 def _split(line: str, separator: str) -> list[str]:
-    """The cells of a line."""
+    """Split a line into its cells."""
     if separator == " ":
         return line.split()
     try:
         return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
-    except csv.Error:  # such as a cell without end
+    except csv.Error:  # for example a quoted cell without end
         return [line]
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """The separator that makes numbers of the largest share of the cells."""
+    """Return the separator with which the largest share of the cells are numbers."""
     best, best_score = ",", (-1.0, 0.0)
     for separator in SEPARATORS:
         rows = [_split(line, separator) for line in lines]
@@ -152,20 +152,20 @@ def _separator(lines: Sequence[str]) -> str:
 
 
 def _width(rows: Sequence[Sequence[str]]) -> int:
-    """The usual number of cells of a row, empty ones at its end included."""
+    """Return the most frequent number of cells per row, including empty ones at the end."""
     counts = Counter(len(row) for row in rows)
     return max(counts, key=lambda count: (counts[count], count), default=0)
 
 
 def _filled(row: Sequence[str], width: int) -> list[str]:
-    """A row's cells, stripped, at most and at least `width` of them."""
+    """Strip the cells of a row, and shorten or extend it to `width` cells."""
     return [cell.strip() for cell in [*row, *[""] * width][:width]]
 
 
 def _numeric_columns(rows: Iterable[Sequence[str]], width: int) -> list[int]:
-    """Places of the columns in which more cells are numbers than are text."""
+    """Return the positions of the columns in which at least half of the cells are numbers."""
     even = [row for row in rows if len(row) == width]
-    # The end of what was looked at is data, whatever stands above.
+    # The second half of the inspected rows is data, whatever precedes it.
     body = even[len(even) // 2 :]
     result = []
     for place in range(width):
@@ -176,7 +176,7 @@ def _numeric_columns(rows: Iterable[Sequence[str]], width: int) -> list[int]:
 
 
 def _is_data(row: Sequence[str], width: int, columns: Sequence[int]) -> bool:
-    """Whether a row is one of numbers rather than of names, notes or units."""
+    """Return whether a row contains numbers rather than names, notes or units."""
     if len(row) != width:
         return False
     cells = [row[place].strip() for place in columns]
@@ -188,7 +188,7 @@ def _is_data(row: Sequence[str], width: int, columns: Sequence[int]) -> bool:
 def _header(
     line: str, separator: str, width: int, columns: Sequence[int]
 ) -> tuple[str, ...] | None:
-    """The names that a line gives to the columns; None where it is no header."""
+    """Return the column names in a line; None if it is not a header."""
     comment = COMMENT.match(line)
     # `%time,field.data` of rostopic begins with a name, `% t q1` of Matlab with a comment.
     marked = comment is not None and not re.match(r"%\w", line.strip())
@@ -197,7 +197,8 @@ def _header(
     while len(names) > width and not names[-1].strip():
         names.pop()
     if len(names) != width and marked:
-        # NumPy writes the header as it was given, whatever stands between the numbers.
+        # NumPy writes the header as given by the user, who may use a separator other than that of
+        # the rows.
         for other in SEPARATORS:
             parts = [part.strip() for part in _split(text, other)]
             if len(parts) == width and all(map(_NAME.fullmatch, parts)):
@@ -209,14 +210,14 @@ def _header(
     numbers = [stripped[place] for place in columns if is_numeric(stripped[place])]
     if missing > 1 or (columns and is_numeric(stripped[columns[0]])):
         return None
-    # Joints may be numbered, `time,1,2,3`; a note beside a number is no header, `Rate;100`.
+    # Joints may be numbered, `time,1,2,3`, but a note with a number is not a header, `Rate;100`.
     if not all(number.isdigit() for number in numbers) or len(set(numbers)) < len(numbers):
         return None
     return tuple(stripped)
 
 
 def _units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
-    """Units by place where a row holds nothing but units; an empty table elsewhere."""
+    """Return the units by position if a row contains units only; otherwise nothing."""
     found = {}
     for place in columns:
         text = row[place].strip("[](){}<> ") if row[place] else ""
@@ -230,20 +231,20 @@ def _units(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
 
 
 def _counted(rows: Mapping[int, Sequence[str]], first: int) -> tuple[str, ...]:
-    """Names of columns that pandas has numbered because nobody has named them; else nothing."""
+    """Return the column numbers that pandas writes for unnamed columns; otherwise nothing."""
     own = tuple(cell.strip() for cell in rows[first])
     numbers = own[1:] if own and not own[0] else own
     counts = [tuple(str(start + k) for k in range(len(numbers))) for start in (0, 1)]
     if len(numbers) < 3 or numbers not in counts:
         return ()
-    # Row by row they would be numbers of a log, too, if what follows were whole numbers as well.
+    # A first row 0, 1, 2, ... may also be data, unless the following rows contain fractions.
     following = [row for line, row in rows.items() if line > first]
     fractions = any("." in cell or "," in cell for row in following for cell in row)
     return own if fractions else ()
 
 
 def is_numeric(cell: str) -> bool:
-    """Whether a cell holds a number, a list of numbers or an instant, or says that it has none."""
+    """Return whether a cell holds a number, a list of numbers, a time or a missing-number mark."""
     text = cell.strip()
     if NUMBER.fullmatch(text) or text.lower() in NO_NUMBER:
         return True

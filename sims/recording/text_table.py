@@ -1,7 +1,7 @@
-"""Tables of text as loggers and spreadsheets write them: numbers by the names of their columns.
+"""Read text tables, as loggers and spreadsheets write them, into numeric columns by name.
 
-Decimal commas are read where the separator, or the cells themselves, leave no doubt; a cell that is
-not what its column holds is refused with its row.
+Decimal commas are read where the separator or the cells of the file make them unambiguous. A cell
+that does not fit its column is refused with the number of its row.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from sims.user_toml import shown
 
 @dataclass(frozen=True)
 class TextTable:
-    """The columns of a table of text.
+    """Columns of a text table.
 
     Attributes:
-        columns: numbers by name, (T,) or (T, k), NaN where missing.
-        texts: names of the columns that hold none.
-        units: by column, where a row of the table states them.
-        unlisted: columns that another one holds under the name of its joint.
-        named: whether the file names its columns.
-        first: line of the first row of data, counted from 1.
+        columns: Numeric columns by name, (T,) or (T, k), NaN where a cell is missing.
+        texts: Names of the columns that hold text.
+        units: Unit of each column for which a row of the table states one.
+        unlisted: Columns that are also available under the name of their joint.
+        named: Whether the file names its columns.
+        first: Line of the first data row, counted from 1.
     """
 
     columns: Mapping[str, Array]
@@ -53,18 +53,18 @@ class TextTable:
 
 
 def read_text_table(path: Path) -> TextTable:
-    """Read a table of text of any layout.
+    """Read a text table and find its layout (separator, header, rows of units) automatically.
 
     Raises:
-        InputError: it is not a table, or a cell is not what its column holds; in one line that
-            says the row.
+        InputError: The file is not a table, or a cell does not fit its column; the one-line message
+            states the row.
     """
     layout = find_layout(path)
     cells = _cells(path, layout)
     columns: dict[str, Array] = {}
     texts: dict[str, list[str]] = {}
     kinds = [_CellKind(column, layout.separator) for column in cells]
-    # One column may leave open what another one shows: `1,234` is 1.234 in a file that has `0,5`.
+    # One column may resolve an ambiguity of another: `1,234` is 1.234 in a file that has `0,5`.
     commas = any(kind.has_decimal_commas for kind in kinds)
     for name, kind in zip(_names(layout), kinds, strict=True):
         values = kind.numbers(path, layout, name, commas)
@@ -85,7 +85,7 @@ def read_text_table(path: Path) -> TextTable:
 
 
 def _names(layout: Layout) -> list[str]:
-    """A different name for each column, as pandas makes them: ``q``, ``q.1``, ``Unnamed: 3``."""
+    """Make the column names unique as pandas does: ``q``, ``q.1``, ``Unnamed: 3``."""
     names = layout.names or tuple(f"column {place + 1}" for place in range(layout.width))
     result: list[str] = []
     for place, name in enumerate(names):
@@ -98,14 +98,14 @@ def _names(layout: Layout) -> list[str]:
 
 
 def _cells(path: Path, layout: Layout) -> list[Any]:
-    """The cells of each column, texts."""
+    """Read the text cells of each column."""
     import pandas
 
     separator = r"\s+" if layout.separator == " " else layout.separator
     for encoding in (layout.encoding, "cp1252"):
         try:
             with path.open(encoding=encoding, newline="") as file:
-                # A quotation mark in a note above must not swallow the rows.
+                # A quotation mark in a note above the header must not swallow the rows.
                 for _ in range(layout.first - 1):
                     next(file, "")
                 table = pandas.read_csv(
@@ -117,7 +117,7 @@ def _cells(path: Path, layout: Layout) -> list[Any]:
                     skipinitialspace=True,
                 )
             break
-        except UnicodeDecodeError:  # beyond the first bytes
+        except UnicodeDecodeError:  # a byte after the inspected head of the file
             continue
         except pandas.errors.EmptyDataError:
             return [np.array([], dtype=object)] * layout.width
@@ -128,7 +128,7 @@ def _cells(path: Path, layout: Layout) -> list[Any]:
     comment = table[0].str.match(COMMENT.pattern)
     if comment.any():
         table = table[~comment.to_numpy(dtype=bool)]
-    # The reader fills rows that are too short.
+    # pandas fills up rows that are too short.
     if (table[table.columns[-1]].fillna("") == "").any() and (fault := _uneven(path, layout)):
         raise fault
     while table.shape[1] > layout.width and (table[table.columns[-1]].fillna("") == "").all():
@@ -143,7 +143,7 @@ def _cells(path: Path, layout: Layout) -> list[Any]:
 
 
 def _not_a_table(path: Path, layout: Layout, error: Exception) -> InputError:
-    """What to say of a file whose rows the reader cannot tell apart."""
+    """Make the error for a file whose rows pandas cannot split."""
     opened = re.search(r"EOF inside string starting at row (\d+)", str(error))
     if opened:
         row = layout.first + int(opened[1])
@@ -158,7 +158,7 @@ def _not_a_table(path: Path, layout: Layout, error: Exception) -> InputError:
 
 
 def _uneven(path: Path, layout: Layout) -> InputError | None:
-    """What to say of the first row with another number of cells; None where all are even."""
+    """Make the error for the first row with a wrong number of cells; None if all rows are even."""
     line = layout.first
     try:
         for line, last, row in _rows(path, layout):
@@ -189,7 +189,7 @@ def _uneven(path: Path, layout: Layout) -> InputError | None:
 
 
 def _rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
-    """The rows of data with their first and last lines, comments and blank lines left out."""
+    """Iterate over the data rows with their first and last lines; skip comments and blank lines."""
     with path.open(encoding=layout.encoding, errors="replace", newline="") as file:
         if layout.separator == " ":
             for line, text in enumerate(file, start=1):
@@ -208,7 +208,7 @@ def _rows(path: Path, layout: Layout) -> Iterator[tuple[int, int, list[str]]]:
 
 
 def _last_line(path: Path, layout: Layout) -> int:
-    """The line of the last row of data."""
+    """Return the line of the last data row."""
     last = 0
     for line, *_ in _rows(path, layout):
         last = line
@@ -216,7 +216,7 @@ def _last_line(path: Path, layout: Layout) -> int:
 
 
 def _line_of(path: Path, layout: Layout, record: int) -> int:
-    """The line of a row of data, counted from 1 as an editor shows it."""
+    """Return the line of a data row, counted from 1 as in an editor."""
     for number, (line, *_) in enumerate(_rows(path, layout)):
         if number == record:
             return line
@@ -224,11 +224,11 @@ def _line_of(path: Path, layout: Layout, record: int) -> int:
 
 
 MAX_SAMPLED_CELLS = 1000
-"""Maximum number of cells of a column by which text is told from numbers with commas."""
+"""Maximum number of cells with commas per column inspected to distinguish text from numbers."""
 
 
 class _CellKind:
-    """The cells of one column, and what kind of numbers they hold."""
+    """Cells of one column and the kind of numbers that they hold."""
 
     def __init__(self, cells: Any, separator: str) -> None:
         import pandas
@@ -240,7 +240,7 @@ class _CellKind:
         self.has_commas, self.has_decimal_commas, self.is_thousands = False, False, False
         commas = self.filled[self.filled.str.contains(",", regex=False)]
         some = commas.iloc[:: max(len(commas) // MAX_SAMPLED_CELLS, 1)]
-        # A list has commas, too, and a text may have.
+        # Lists and texts may contain commas, too.
         if commas.empty or 2 * sum(map(bool, map(NUMBER.fullmatch, some))) < len(some):
             return
         self.has_commas = True
@@ -249,12 +249,26 @@ class _CellKind:
         if separator != ",":
             self.has_decimal_commas = not self.is_thousands
         else:
-            # Three digits behind a comma may be thousands, unless other cells say what they are.
+            # Three digits after a comma may be a group of thousands, unless other cells show
+            # decimals.
             groups = commas.str.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?")
             self.has_decimal_commas = not bool(groups.all()) and not self.is_thousands
 
     def numbers(self, path: Path, layout: Layout, name: str, commas: bool) -> Array | None:
-        """(T,) or (T, k) numbers; None where the column holds text."""
+        """Convert the cells to numbers.
+
+        Args:
+            path: Path of the table, for messages.
+            layout: Layout of the table.
+            name: Name of the column, for messages.
+            commas: Whether another column of the file has decimal commas.
+
+        Returns:
+            Numbers (T,) or (T, k); None if the column holds text.
+
+        Raises:
+            InputError: A cell is not a number, or its comma is ambiguous.
+        """
         import pandas
 
         if self.filled.empty:
@@ -287,14 +301,15 @@ class _CellKind:
         raise self._fault(path, layout, name, int(bad[0]), "a number")
 
     def _decimal_points(self, path: Path, layout: Layout, name: str) -> Any:
-        """The cells with decimal points in place of decimal commas."""
+        """Return the cells with decimal points instead of decimal commas."""
         grouped = self.filled.str.fullmatch(r"[+-]?\d{1,3}(\.\d{3})+(,\d*)?")
         if self.filled.str.contains(r"\..*,", regex=True).any():
             texts = self.series.str.replace(r"\.(?=\d{3}(\D|$))", "", regex=True)
         else:
             points = self.filled.str.contains(".", regex=False)
             if points.any():
-                # 1.234 is a thousand in one of the two ways to write, and one in the other.
+                # With a decimal comma, 1.234 is more than a thousand; with a decimal point, it is
+                # about one.
                 row = int(points.index.to_numpy()[points.to_numpy().argmax()])
                 more = "; other cells of this column have decimal commas"
                 if not grouped[points].all():
@@ -304,7 +319,7 @@ class _CellKind:
         return texts.str.replace(",", ".", n=1, regex=False)
 
     def _instants(self, path: Path, layout: Layout, name: str) -> Array | None:
-        """(T,) seconds since 1970 of instants such as ``2026-11-26 17:24:01.123``."""
+        """Convert times such as ``2026-11-26 17:24:01.123`` to (T,) seconds since 1970."""
         import pandas
 
         empty = (self.series == "").to_numpy(dtype=bool)
@@ -320,7 +335,7 @@ class _CellKind:
         return np.where(stamps.isna().to_numpy(), np.nan, whole * 1e-9)
 
     def _lists(self, path: Path, layout: Layout, name: str) -> Array:
-        """(T, k) of cells such as ``[0.1, 0.2]``."""
+        """Convert cells such as ``[0.1, 0.2]`` to an array (T, k)."""
         rows: list[list[float]] = []
         for number, text in enumerate(self.texts):
             match = NUMBERS.fullmatch(text)
@@ -338,7 +353,7 @@ class _CellKind:
     def _fault(
         self, path: Path, layout: Layout, name: str, record: int, wanted: str, more: str = ""
     ) -> InputError:
-        """What to say of a cell that is not what its column holds."""
+        """Make the error for a cell that does not fit its column."""
         line = _line_of(path, layout, record)
         found = shown(self.cells[record])
         return InputError(

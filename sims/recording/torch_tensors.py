@@ -1,10 +1,9 @@
-"""Tensors of PyTorch files (``.pt``, ``.pth``), read as the zip archives that they are, without
-torch and without unpickling.
+"""Read tensors of PyTorch files (``.pt``, ``.pth``) without torch and without unpickling.
 
-An archive holds ``data.pkl``, a program of pickle that builds lists and dictionaries of tensors;
-their numbers are in ``data/0``, ``data/1`` and so on. The program is read step by step
-(`pickletools`). Only steps that build containers and tensors are carried out: no name in it is
-imported or called. (Layout: pytorch, torch/serialization.py.)
+The files are zip archives. An archive holds ``data.pkl``, a pickle program that builds lists and
+dictionaries of tensors; their numbers are in ``data/0``, ``data/1`` and so on. The program is read
+step by step (`pickletools`). Only steps that build containers and tensors are carried out: no name
+in it is imported or called. (Layout: pytorch, torch/serialization.py.)
 """
 
 from __future__ import annotations
@@ -20,36 +19,36 @@ from sims.base import Array, InputError, frozen
 from sims.recording.columnar import WIDEST
 
 ENDINGS = (".pt", ".pth")
-"""Endings of the names of PyTorch files."""
+"""File name endings of PyTorch files."""
 MAX_PROGRAM = 10_000_000
-"""Maximum number of bytes of the program of an archive."""
+"""Maximum size of the pickle program of an archive, in bytes."""
 MAX_ENTRIES = 250_000_000
 """Maximum number of entries of a tensor (2 GB of 64-bit numbers)."""
 MAX_DEPTH = 8
-"""Maximum number of containers within containers."""
+"""Maximum depth of nested containers."""
 _TYPES = {
     "FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2", "LongStorage": "<i8",
     "IntStorage": "<i4", "ShortStorage": "<i2", "CharStorage": "i1", "ByteStorage": "u1",
     "BoolStorage": "?", "BFloat16Storage": "<u2",
 }  # fmt: skip
-"""Types of the numbers of a storage, by its class of torch."""
+"""Number type of each torch storage class."""
 
 
 class _Name(NamedTuple):
-    """A name in the program, which stands for a class or a function and is never imported."""
+    """Name of a class or function in the program, which is never imported."""
 
     text: str
 
 
 class _Storage(NamedTuple):
-    """Numbers in the archive: their type, and the name of their entry."""
+    """Numbers in the archive: their storage class, and the name of their archive entry."""
 
     kind: str
     key: str
 
 
 class _Tensor(NamedTuple):
-    """A tensor: where its numbers are, and how they lie there."""
+    """Tensor: its storage, and the offset, size and strides of its numbers there."""
 
     storage: _Storage
     offset: int
@@ -58,7 +57,7 @@ class _Tensor(NamedTuple):
 
 
 class _Other(NamedTuple):
-    """An object of another class, which is left out."""
+    """Object of another class, which is left out."""
 
     name: str
 
@@ -67,10 +66,14 @@ _MARK = _Other("mark")
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
-    """Read the tensors of a file by name, (T,) or (T, k), and its lists of texts.
+    """Read the tensors of a PyTorch file, and its lists of texts.
+
+    Returns:
+        Tensors by name, (T,) or (T, k), and the texts of each other entry, empty where it holds
+        something else.
 
     Raises:
-        InputError: it is not an archive of PyTorch, in one line.
+        InputError: The file is not a PyTorch archive; the message is one line.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -82,7 +85,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Array], dict[str, list[str]]]:
         ) from None
     except (InputError, MemoryError, KeyboardInterrupt):
         raise
-    except Exception as error:  # a spoilt archive or program trips any step
+    except Exception as error:  # a damaged archive or program can fail in any step
         raise InputError(
             f"{path}: not a PyTorch file that can be read ({type(error).__name__})"
         ) from None
@@ -109,10 +112,10 @@ def _tensors(path: Path, archive: zipfile.ZipFile) -> tuple[dict[str, Array], di
 
 
 def _entries(name: str, value: Any, depth: int) -> list[tuple[str, Any]]:
-    """Whatever containers hold, by name; lists of numbers and texts are not taken apart.
+    """Flatten nested containers to named entries; lists of numbers and texts stay whole.
 
     Raises:
-        ValueError: there are more than `WIDEST` entries, as where containers hold each other.
+        ValueError: There are more than `WIDEST` entries, as where containers hold each other.
     """
     inside: list[tuple[Any, Any]] = []
     if isinstance(value, dict):
@@ -130,12 +133,12 @@ def _entries(name: str, value: Any, depth: int) -> list[tuple[str, Any]]:
 
 
 def _is_container(value: Any) -> bool:
-    """Whether a value is a tensor, or may hold some."""
+    """Return whether a value is a tensor, or may contain some."""
     return isinstance(value, dict | list | _Tensor)
 
 
 def _numbers(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Tensor) -> Array:
-    """The numbers of a tensor."""
+    """Read the numbers of a tensor."""
     kind = _TYPES.get(tensor.storage.kind)
     if kind is None:
         raise InputError(f"{path}: expected tensors of numbers, found {tensor.storage.kind}")
@@ -146,7 +149,7 @@ def _numbers(path: Path, archive: zipfile.ZipFile, folder: str, tensor: _Tensor)
         raise InputError(f"{path}: {entry} is too large for a log of tensors")
     flat = np.frombuffer(archive.read(entry), dtype=kind)
     if tensor.storage.kind == "BFloat16Storage":
-        # The upper half of a 32-bit number.
+        # A bfloat16 is the upper half of a 32-bit number.
         flat = (flat.astype(np.uint32) << 16).view(np.float32)
     if 0 in tensor.size:
         return frozen(np.empty(tensor.size))
@@ -163,7 +166,7 @@ def _content(program: bytes) -> Any:
     """Carry out the steps of a program that build containers and tensors.
 
     Raises:
-        ValueError: there is another step.
+        ValueError: The program contains another step.
     """
     stack: list[Any] = []
     memo: dict[int, Any] = {}
@@ -205,11 +208,11 @@ _NUMBERS_AND_TEXTS = (
     "BININT", "INT", "LONG", "BINFLOAT", "FLOAT", "BINUNICODE", "SHORT_BINUNICODE", "UNICODE",
     "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES",
 )  # fmt: skip
-"""Beginnings of the names of steps that put a number or a text on the stack."""
+"""Beginnings of the names of steps that push a number or a text onto the stack."""
 
 
 def _build(name: str, stack: list[Any]) -> None:
-    """One step that takes values from the stack and builds something of them."""
+    """Carry out one step that takes values from the stack and builds an object from them."""
     if name in ("TUPLE", "LIST", "DICT", "APPENDS", "SETITEMS"):
         place = max(i for i, value in enumerate(stack) if value is _MARK)
         values = stack[place + 1 :]
@@ -249,7 +252,7 @@ def _build(name: str, stack: list[Any]) -> None:
 
 
 def _made(made_by: Any, arguments: Any) -> Any:
-    """What a call in the program stands for: a tensor, a dictionary, or something left out."""
+    """Return the result of a call in the program: a tensor, a dictionary, or a placeholder."""
     name = made_by.text if isinstance(made_by, _Name) else ""
     if name == "torch._utils._rebuild_tensor_v2":
         storage, offset, size, stride, *_ = arguments
@@ -262,10 +265,10 @@ def _made(made_by: Any, arguments: Any) -> Any:
 
 
 def _list(value: Any) -> list[Any]:
-    """A list; one that is thrown away in place of what is none."""
+    """Return a list unchanged, and a new list, which is discarded, for any other value."""
     return value if isinstance(value, list) else []
 
 
 def _dict(value: Any) -> dict[Any, Any]:
-    """A dictionary; one that is thrown away in place of what is none."""
+    """Return a dictionary unchanged, and a new one, which is discarded, for any other value."""
     return value if isinstance(value, dict) else {}

@@ -1,4 +1,4 @@
-"""Whole turns of angles that are recorded within one turn."""
+"""Unwrap angles that are recorded within one turn."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ from sims.base import Array
 
 
 def unwrapped(positions: Array, command: Array | None = None) -> Array:
-    """Restore the whole turns of a wrapped position; NaN stays.
+    """Restore the whole turns of a wrapped position; NaN stays NaN.
 
     Args:
-        positions: (T,) in rad.
-        command: (T,) of the joint's position servo in rad, which tells the turn.
+        positions: (T,) positions, rad.
+        command: (T,) command of the joint's position servo, rad, which determines the turn; None if
+            there is none.
+
+    Returns:
+        (T,) positions, rad.
     """
     result = positions.copy()
     finite = np.isfinite(positions)

@@ -1,5 +1,6 @@
-"""Units as people write them in the names of columns: ``q1 [deg]``, ``pos (rad)``, ``elbow_deg``,
-``Zeit [ms]``; and in a row of their own below the header.
+"""Recognise units in the names of columns and in a row of units.
+
+Examples are ``q1 [deg]``, ``pos (rad)``, ``elbow_deg`` and ``Zeit [ms]``.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import Literal, NamedTuple
 
 Quantity = Literal["time", "angle", "length", "angular velocity", "velocity", "acceleration",
                    "torque", "force", "current", "counts", "other"]  # fmt: skip
-"""What a unit measures."""
+"""Quantity that a unit measures."""
 
 _SPELLINGS: Mapping[tuple[str, Quantity], str] = {
     ("s", "time"): "s sec secs second seconds sek sekunden",
@@ -61,18 +62,18 @@ _NEEDS_BRACKETS = frozenset(
 )  # fmt: skip
 _BRACKETS = re.compile(r"(?P<name>.*?)\s*[_.]?[\[({<](?P<unit>[^\[\](){}<>]{1,24})[\])}>]\s*")
 _JOINERS = " _,:;./-\t"
-"""Characters between a name and the unit behind it."""
+"""Characters between a name and the unit that follows it."""
 _CAMEL = re.compile(r"(?P<name>.+[a-z0-9])(?P<unit>Deg|Degrees|Rad|Radians|Nm|RadPerSec|Ms|Us|Ns)")
 
 
 class NamedUnit(NamedTuple):
-    """A column's name without its unit, and the unit and what it measures where the name has one.
+    """Name of a column without its unit, and the unit that was found in the name.
 
     Attributes:
-        name: the name without the unit.
-        unit: as `sims.recording.units` reads it, ``counts`` of an encoder excepted; empty where
-            the name states none.
-        quantity: what the unit measures; None where the name states none.
+        name: Name without the unit.
+        unit: Unit as read by `sims.recording.units`, or ``counts`` of an encoder; empty if the name
+            states none.
+        quantity: Quantity that the unit measures; None if the name states none.
     """
 
     name: str
@@ -81,20 +82,20 @@ class NamedUnit(NamedTuple):
 
 
 def read_unit(text: str) -> tuple[str, Quantity] | None:
-    """Return the unit that a text spells, and what it measures; None where it spells none."""
+    """Return the unit that a text spells and its quantity; None if it is not a known unit."""
     plain = re.sub(r"\s*([*/^·⋅])\s*", r"\1", text.strip().lower().replace("**", "^"))
     return _UNITS.get(plain) or _UNITS.get(plain.replace(" ", "*"))
 
 
 def split_unit(name: str) -> NamedUnit:
-    """Split the name of a column into the name proper and the unit that stands behind it."""
+    """Split the name of a column into the name proper and the unit that follows it."""
     bracketed = _BRACKETS.fullmatch(name)
-    # The brackets of `q[1]` hold a place in a list and no unit.
+    # The brackets of `q[1]` hold an index and no unit.
     if bracketed and bracketed["name"] and not bracketed["unit"].strip().isdigit():
         unit = read_unit(bracketed["unit"])
         if unit is not None:
             return NamedUnit(bracketed["name"], *unit)
-    # `q_rad_s` is in rad/s: the longest unit that stands behind the name is taken.
+    # `q_rad_s` is in rad/s: use the longest unit at the end of the name.
     for place in range(1, len(name)):
         if name[place] not in _JOINERS:
             continue

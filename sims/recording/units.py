@@ -1,7 +1,7 @@
-"""Conversion between units, so that a recording may state its own.
+"""Convert units, so that a recording may use its own.
 
-An angle is a dimension of its own here: by the letter of the SI, hertz would pass for radians per
-second, and a plain number for an angle.
+Angles have their own dimension here: with the SI definition, hertz would be accepted as radians per
+second, and a plain number as an angle.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 from sims.base import InputError
 
 _LONGEST = 60
-"""Characters of a unit."""
+"""Maximum number of characters of a unit."""
 _ROUNDING = 1e-9
-"""Share of the gain by which a conversion in proportion may miss being one."""
-# All that a unit needs, and nothing that could make the parser behind compute for long: names, 1,
-# small powers.
+"""Relative deviation from a linear conversion that is accepted as rounding error."""
+# Allow names, 1 and small powers only, so that the parser of pint cannot be made to compute for
+# long.
 _TOKEN = re.compile(
     r"\s*(?:(?P<power>(?:\*\*|\^)\s*[+-]?\d{1,2}(?!\d)|⁻?[¹²³⁴])"
     r"|(?P<operator>[*/·⋅])|(?P<bracket>[()])"
@@ -26,23 +26,27 @@ _TOKEN = re.compile(
 
 
 class Scale(NamedTuple):
-    """How a unit becomes another: value * gain + offset."""
+    """Linear conversion of a unit: value * gain + offset."""
 
     gain: float
     offset: float
 
 
 SAME = Scale(1.0, 0.0)
-"""Nothing to convert, so that values stay as they are, bit for bit."""
+"""Identity conversion, which leaves values unchanged bit for bit."""
 
 
 @lru_cache(maxsize=256)
 def scale(unit: str, target: str) -> Scale:
-    """How values in `unit` become values in `target`.
+    """Return the conversion from `unit` to `target`.
+
+    Args:
+        unit: Unit of the values.
+        target: Unit to convert them to.
 
     Raises:
-        InputError: `unit` is no unit, or does not convert to `target`; the message begins with what
-            is wrong with it and names neither file nor channel.
+        InputError: `unit` is not a unit or does not convert to `target`; the message names neither
+            file nor channel, so that the caller can put them in front.
     """
     if unit == target:
         return SAME
@@ -52,15 +56,15 @@ def scale(unit: str, target: str) -> Scale:
     try:
         parsed = registry.parse_units(unit or "1")
     except Exception:
-        # the parser raises whatever it trips over
+        # The parser raises many kinds of errors.
         raise InputError(f"unknown unit {unit!r}; expected one that converts to {target}") from None
     try:
-        # three values tell gain and offset, and whether that is all there is to it
+        # Three values determine gain and offset, and show whether the conversion is linear.
         zero, one, two = (
             float(registry.Quantity(v, parsed).to(target).magnitude) for v in (0.0, 1.0, 2.0)
         )
     except Exception:
-        # dimensions differ, or the unit is logarithmic
+        # The dimensions differ, or the unit is logarithmic.
         hint = "; standard gravity is g_0" if unit == "g" else ""
         raise InputError(
             f"expected a unit that converts to {target}, found {unit!r}{hint}"
@@ -68,24 +72,28 @@ def scale(unit: str, target: str) -> Scale:
     gain = one - zero
     if abs(two - one - gain) > _ROUNDING * abs(gain):
         raise InputError(f"expected a unit that converts to {target} in proportion, found {unit!r}")
-    # what differs from 1 by rounding is 1
+    # A gain that differs from 1 by rounding is 1.
     return SAME if zero == 0.0 and abs(gain - 1.0) < 1e-12 else Scale(gain, zero)
 
 
 def is_unit(unit: str) -> bool:
-    """Return whether `unit` can be converted: pint knows every name in it."""
+    """Return whether `unit` can be converted, which means that pint knows every name in it."""
     if len(unit) > _LONGEST or not _plain(unit):
         return False
     try:
         _registry().parse_units(unit)
     except Exception:
-        # the parser raises whatever it trips over
+        # The parser raises many kinds of errors.
         return False
     return True
 
 
 def _plain(unit: str) -> bool:
-    """Whether the text is names and 1, joined by * / or spaces, each perhaps to one small power."""
+    """Return whether a text is a simple unit.
+
+    A simple unit consists of names and 1, joined by * / or spaces, each with at most one small
+    power.
+    """
     place, before = 0, "operator"
     while place < len(unit):
         token = _TOKEN.match(unit, place)
@@ -97,13 +105,13 @@ def _plain(unit: str) -> bool:
 
 @lru_cache(maxsize=1)
 def _registry() -> Any:
-    # here, since it takes a second, and most recordings are in SI
+    # Imported here: it takes a second, and most recordings are in SI units.
     import pint
 
     registry: Any = pint.UnitRegistry(on_redefinition="ignore")
     registry.define("radian = [angle] = rad")
-    # it means the count of a yarn otherwise
+    # In pint, Nm is the count of a yarn by default.
     registry.define("newton_meter = newton * meter = Nm")
-    # forgets that an angle was a plain number
+    # Clear the cache, in which an angle is still a plain number.
     registry._build_cache()
     return registry

@@ -1,5 +1,6 @@
-"""Recordings written by this project: `NAME.csv` and `NAME.toml`, all of it or nothing, never over
-what is there.
+"""Write recordings, `NAME.csv` and `NAME.toml`.
+
+Either all files are written or none, and existing files are never overwritten.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from sims.recording.description import description_of
 from sims.recording.recording import Declared, Recording, Run
 
 _EXACT = 17
-"""Significant digits that keep every bit of a number."""
+"""Number of significant digits with which a number is written without loss."""
 
 
 def write_recording(
@@ -29,17 +30,17 @@ def write_recording(
     digits: int = _EXACT,
     beside: Mapping[Path, Content] | None = None,
 ) -> None:
-    """Write a recording such that `read_recording` gives the same back, in SI units.
+    """Write a recording such that `read_recording` gives it back unchanged, in SI units.
 
     Args:
-        path: the table to write; `recording.path` is not used.
-        recording: what to write; its runs have different names and the same columns.
-        declared: the system, for the units.
-        digits: significant digits of a number; 17 keep every bit.
-        beside: other files to write with it, all or none.
+        path: Table to write; `recording.path` is not used.
+        recording: Recording to write; its runs have different names and the same columns.
+        declared: System, for the units.
+        digits: Significant digits of a number; with 17, nothing is lost.
+        beside: Other files to write together with it, all or none.
 
     Raises:
-        InputError: a file exists already or cannot be written, or the runs cannot stand in one
+        InputError: A file exists already or cannot be written, or the runs do not fit into one
             table.
     """
     table = Path(path)
@@ -55,10 +56,10 @@ def write_recording(
 
 
 def publish(contents: Mapping[Path, Content]) -> None:
-    """Write all files or none; readers never see half of one.
+    """Write all files or none; readers never see a partly written file.
 
     Raises:
-        InputError: one exists already, or cannot be written.
+        InputError: A file exists already, or cannot be written.
     """
     refuse_existing(contents)
     try:
@@ -73,7 +74,7 @@ def refuse_existing(paths: Iterable[Path]) -> None:
     """Check that none of the files exists.
 
     Raises:
-        InputError: one does.
+        InputError: A file exists already.
     """
     for path in paths:
         if path.exists():
@@ -91,7 +92,7 @@ def _table(runs: Sequence[Run], digits: int) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     extra = list(runs[0].extra)
-    # One table has one set of columns: the first run's, which the others must share.
+    # The columns are those of the first run, and all other runs must have the same.
     writer.writerow(["run", "t", *inputs, *channels, *extra])
     seen: set[str] = set()
     for run in runs:
@@ -130,13 +131,19 @@ def _signals(
 
 
 def _cells(values: Array, digits: int) -> list[str]:
-    # Python's shortest text that gives the same number back; a missing sample is an empty cell.
+    # repr gives the shortest text that is read back as the same number; a missing sample is an
+    # empty cell.
     shortest = repr if digits >= _EXACT else f"{{:.{digits}g}}".format
     return [shortest(v) if math.isfinite(v) else "" for v in values.tolist()]
 
 
 def _of(recording: Recording, beside: Path) -> dict[str, Any]:
-    """What a recording is of: its system, or its model file as seen from the folder `beside`."""
+    """Return the keys that state what was recorded: a system, or a model file.
+
+    Args:
+        recording: Recording.
+        beside: Folder to which the path of the model file is relative.
+    """
     model = recording.model
     if model is None:
         return {"system": recording.system}

@@ -1,8 +1,7 @@
-"""Six kinds of ball. Masses, sizes and bounces are those that their sports' rules ask for, or that
-were measured.
+"""Physical data of six kinds of balls, from the rules of their sports or from measurements.
 
-The rules give a height H that the ball is dropped from on a hard floor and the heights h that it
-may come back to; the restitution is that of the impact speed of that drop,
+The rules give a height H from which the ball is dropped on a hard floor and the range of heights h
+to which it must return; the restitution is that of the impact speed of that drop,
 
     e = sqrt(h / H)    at    v = sqrt(2 g H)                               (1)
 
@@ -10,7 +9,7 @@ and at another speed u
 
     e(u) = e (u / v)^p                                                     (2)
 
-Balls of a kind differ within those limits. Chosen here, not taken from tables: the power p of the
+Balls of a kind vary within those limits. Chosen here, not taken from tables: the power p of the
 impact speed with which restitution falls (a yielding ball's is -1/4, a viscoelastic one's weaker:
 K. L. Johnson, Contact Mechanics, 1985, chapter 11), the moments of inertia (a solid sphere's, a
 thin shell's, or between for a thick one) and the drag coefficients (0.5 for a sphere below the drag
@@ -27,24 +26,24 @@ import numpy as np
 from sims.base import unknown
 
 _SLOWEST = 1e-3
-"""m/s: impacts slower than this bounce as this one does, since (2) grows without bound."""
+"""Impact speed in m/s below which the restitution is constant, because (2) is unbounded."""
 
 
 @dataclass(frozen=True)
 class BallKind:
-    """One ball.
+    """Properties of one ball.
 
     Attributes:
-        name: its kind.
-        mass: kg.
-        radius: m.
-        restitution: at an impact of `speed`, on a hard surface.
-        spread: balls of the kind lie within this of it.
-        speed: m/s.
-        exponent: restitution goes with this power of the impact speed.
-        inertia_ratio: moment of inertia over mass x radius^2.
-        drag: drag coefficient, of the cross-section.
-        source: where mass, radius and restitution stand.
+        name: Name of its kind.
+        mass: Mass, kg.
+        radius: Radius, m.
+        restitution: Coefficient of restitution on a hard surface at the impact speed `speed`.
+        spread: Maximum deviation of the restitution of balls of this kind.
+        speed: Impact speed at which `restitution` applies, m/s.
+        exponent: Exponent of the impact speed in the restitution, p of equation (2).
+        inertia_ratio: Moment of inertia over mass x radius^2.
+        drag: Drag coefficient with respect to the cross-section.
+        source: Source of mass, radius and restitution.
     """
 
     name: str
@@ -59,12 +58,12 @@ class BallKind:
     source: str
 
     def restitution_at(self, speed: float) -> float:
-        """At an impact speed in m/s; at most 1."""
+        """Return the restitution at an impact speed in m/s; at most 1."""
         ratio = max(speed, _SLOWEST) / self.speed
         return min(1.0, self.restitution * float(ratio**self.exponent))  # (2)
 
     def one(self, rng: np.random.Generator) -> BallKind:
-        """A ball of this kind, as its restitution goes."""
+        """Draw a ball of this kind with random restitution."""
         own = self.restitution + self.spread * float(rng.uniform(-1.0, 1.0))
         return replace(self, restitution=own)
 
@@ -167,10 +166,10 @@ BALLS = MappingProxyType({ball.name: ball for ball in _BALLS})
 
 
 def ball_named(name: str) -> BallKind:
-    """The kind of ball of this name.
+    """Return the kind of ball with this name.
 
     Raises:
-        InputError: there is none.
+        InputError: There is no such kind.
     """
     if name not in BALLS:
         raise unknown("ball", name, list(BALLS))

@@ -1,4 +1,4 @@
-"""Finds the drop height for which a simulator scores, with as much room to the rim as there is."""
+"""Plan the drop height for which a simulator scores with the largest distance to the rim."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from sims.shot.scene import ShotScene, margins
 from sims.shot.simulator import BounceShot
 
 _GRID = 48
-"""Heights of the first grid, over the whole range."""
+"""Number of heights of the first grid, over the whole range."""
 _ROUNDS = 4
-"""Grids, each around the best height of the one before."""
+"""Number of successive grids, each around the best height of the previous one."""
 _ZOOM = 9
-"""Heights of each later grid, over two spaces of the one before."""
+"""Number of heights of each later grid, which covers two intervals of the previous one."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A shot.
+    """Planned shot.
 
     Attributes:
-        height: drop height, m; NaN where the simulator reaches the hoop's plane from none.
-        margin: the simulator's distance to the rim, m; negative where it expects to miss.
-        times: (T,) seconds.
-        path: (T, 3) x, y, z of the centre as simulated.
+        height: Drop height, m; NaN if the simulator crosses the hoop's plane from no height.
+        margin: Simulated distance to the rim, m; negative if a miss is expected.
+        times: (T,) times of the path, s.
+        path: (T, 3) simulated x, y, z of the centre, m.
     """
 
     height: float
@@ -37,7 +37,7 @@ class Plan:
 
     @property
     def found(self) -> bool:
-        """Whether there is a height at all."""
+        """Whether a drop height was found."""
         return bool(np.isfinite(self.height))
 
 
@@ -50,22 +50,22 @@ def plan(
     seconds: float = 3.0,
     rate: float = 240.0,
 ) -> Plan:
-    """The drop height of the largest margin.
+    """Find the drop height with the largest distance to the rim, by successively finer grids.
 
-    A grid over all heights, then finer ones around its best: there is one maximum as a rule, but
-    need not be, and a height from which the hoop is not reached gives no direction.
+    Grids are used because the distance may have several maxima, and because heights from which the
+    hoop is not reached give no search direction.
 
     Args:
-        simulator: tuned, with channels x, y, z.
-        theta: (dim,) its parameters.
-        scene: incline and hoop.
-        constants: what is known of the ball: radius, friction ...
-        heights: lowest and highest, m.
-        seconds: length of the simulated flight.
-        rate: samples a second; the hoop's plane is met on the chord between two.
+        simulator: Tuned simulator with channels x, y, z.
+        theta: (dim,) parameters of the simulator.
+        scene: Geometry of incline and hoop.
+        constants: Known constants of the ball, such as radius and friction.
+        heights: Minimum and maximum height, m.
+        seconds: Length of the simulated flight, s.
+        rate: Sampling rate in Hz; the crossing of the hoop's plane is interpolated linearly.
 
     Raises:
-        InputError: impossible heights.
+        InputError: The heights are not positive and increasing.
     """
     low, high = heights
     if not 0 < low < high:
@@ -79,7 +79,7 @@ def plan(
             break
         best = float(grid[np.nanargmax(room)])
         reach = float(grid[1] - grid[0])
-        # As far as the neighbours of the best: the maximum lies between them.
+        # Up to the neighbours of the best height: the maximum is between them.
         grid = np.linspace(max(low, best - reach), min(high, best + reach), _ZOOM)
     if not np.isfinite(best):
         return Plan(best, float("nan"), times, np.full((times.size, 3), np.nan))
@@ -95,7 +95,19 @@ def flights(
     heights: Array,
     times: Array,
 ) -> Array:
-    """Simulated paths (n, T, 3) from drop heights (n,)."""
+    """Simulate the paths from several drop heights.
+
+    Args:
+        simulator: Simulator with channels x, y, z.
+        theta: (dim,) parameters of the simulator.
+        scene: Geometry of incline and hoop.
+        constants: Known constants of the ball.
+        heights: (n,) drop heights, m.
+        times: (T,) sample times, s.
+
+    Returns:
+        Centres (n, T, 3), m.
+    """
     known = {**constants, "incline_angle": scene.angle}
     scenarios = []
     for height in heights:

@@ -1,4 +1,4 @@
-"""Incline and hoop, and where a path goes through the hoop."""
+"""Geometry of incline and hoop, and the point where a path crosses the hoop's plane."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from sims.base import Array, InputError
 
 @dataclass(frozen=True)
 class ShotScene:
-    """What is known of a shot. Heights count from the point of the incline below the release, where
-    x = 0.
+    """Geometry of a shot.
+
+    Heights count from the point of the incline below the release, where x = 0.
 
     Attributes:
-        angle: of the incline, radians; it falls towards x.
-        hoop_x: centre of the hoop, a horizontal ring, m.
-        hoop_z: its height, m.
-        hoop_radius: m.
+        angle: Angle of the incline, which descends towards x, rad.
+        hoop_x: Centre of the hoop, a horizontal ring, m.
+        hoop_z: Height of the hoop, m.
+        hoop_radius: Radius of the hoop, m.
     """
 
     angle: float
@@ -37,21 +38,26 @@ class ShotScene:
             raise InputError(f"expected a hoop above the incline, found {self}")
 
     def touching(self, radius: float) -> float:
-        """Height of the centre of a ball that touches the incline at x = 0 or would, if let fall
-        there, m.
-        """
+        """Return the height of the centre of a ball that touches the incline at x = 0, m."""
         return radius / math.cos(self.angle)
 
 
 def crossings(path: Array, scene: ShotScene) -> Array:
-    """Where paths (n, T, 3) of centres x, y, z come down through the hoop's plane: (n, 2), NaN for
-    never.
+    """Return the points where paths cross the hoop's plane downwards.
 
-    The flight after the first bounce counts: from where z first rises to where it rises again. With
-    the sample before the plane at height z1 and the one behind it at z2, the hoop's plane at height
-    h is met on the chord between them, at the share
+    Only the flight after the first bounce counts: from where z first rises to where it rises again.
+    With
+    the sample before the plane at height z1 and the one after it at z2, the hoop's plane at height
+    h is crossed on the chord between them, at the share
 
         (z1 - h) / (z1 - z2)                                               (1)
+
+    Args:
+        path: Centres x, y, z of the ball (n, T, 3), m.
+        scene: Geometry of the shot.
+
+    Returns:
+        Points x, y (n, 2), m; NaN for paths that do not cross.
     """
     path = np.asarray(path, dtype=np.float64)
     x, y, z = np.moveaxis(path, -1, 0)
@@ -61,7 +67,7 @@ def crossings(path: Array, scene: ShotScene) -> Array:
         risen = np.logical_or.accumulate(rises, axis=1)
         fallen = np.logical_or.accumulate(risen & falls, axis=1)
         again = np.logical_or.accumulate(fallen & rises, axis=1)
-        # Downward only: a ball that comes up through the hoop has not scored.
+        # Downward only: a ball that crosses upwards has not scored.
         above = z[:, :-1] > scene.hoop_z
         below = z[:, 1:] <= scene.hoop_z
         down = risen & ~again & above & below
@@ -69,7 +75,7 @@ def crossings(path: Array, scene: ShotScene) -> Array:
     rows = np.arange(len(z))
     high = z[rows, first]
     low = z[rows, first + 1]
-    comes = down.any(axis=1)  # where none does, `first` is 0 and means nothing
+    comes = down.any(axis=1)  # for paths without a crossing, `first` is 0 and unused
     share = (high - scene.hoop_z) / np.where(comes, high - low, 1.0)  # (1)
     at_x = x[rows, first] + share * (x[rows, first + 1] - x[rows, first])
     at_y = y[rows, first] + share * (y[rows, first + 1] - y[rows, first])
@@ -79,8 +85,14 @@ def crossings(path: Array, scene: ShotScene) -> Array:
 
 
 def margins(path: Array, scene: ShotScene) -> Array:
-    """(n,) distance in m from where a path comes through the hoop's plane to its rim: > 0 inside;
-    NaN for never.
+    """Return the distances from the crossing points to the rim of the hoop.
+
+    Args:
+        path: Centres x, y, z of the ball (n, T, 3), m.
+        scene: Geometry of the shot.
+
+    Returns:
+        Distances (n,) in m, > 0 inside the hoop; NaN for paths that do not cross its plane.
     """
     place = crossings(path, scene)
     result: Array = scene.hoop_radius - np.hypot(place[:, 0] - scene.hoop_x, place[:, 1])

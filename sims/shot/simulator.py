@@ -1,4 +1,4 @@
-"""The bounce shot as a registered simulator."""
+"""Registered simulator of the bounce shot."""
 
 from sims.shot.system import ShotSystem
 from sims.simulated import Simulated

@@ -1,10 +1,11 @@
-"""A ball dropped on an incline, seen in the incline's own frame, where the incline is level ground.
+"""Ball dropped on an incline, described in the frame of the incline, where it is level ground.
 
-The coordinates are the centre's displacement from where it is let go: down the slope, across it,
-and away from it. In that frame gravity is as uniform as ever, only tilted, so every engine, force
-and contact effect works as for a ball on level ground. The channels turn the motion back: x is
-horizontal and points the way the incline falls, z is up, both from the point of the incline below
-the ball. With the incline's angle a, the ball's radius r and the height H through which it falls,
+The coordinates are the displacement of the centre from its release: down the slope, across it, and
+away from it. In that frame gravity is uniform but tilted, so every engine, force and contact effect
+works as for a ball on level ground. The channels transform the motion back: x is horizontal and
+points in the direction in which the incline descends, z is up, both from the point of the incline
+below the ball. With the incline's angle a, the ball's radius r and the height H through which it
+falls,
 
     gravity = g (sin a, 0, -cos a)                                         (1)
     floor = -H cos a                                                       (2)
@@ -25,17 +26,17 @@ from sims.limits import GRAVITY, LENGTH, MASS, RATIO, TURN
 from sims.system import Effect, Kind, Moment, System
 
 _LEVEL_ONLY = ("force.bias", "force.periodic", "lift.magnus")
-"""Effects that act along the last coordinate, taken for the vertical."""
+"""Effects that act along the last coordinate, which they assume to be vertical."""
 
 
 class ShotSystem(System):
-    """A ball that falls `drop_height` on an incline and leaves it on its way to a hoop.
+    """Ball that falls `drop_height` on an incline and bounces towards a hoop.
 
-    At the impact the speed along the normal turns round and is multiplied by the restitution.
-    Friction takes tangential speed as from a sphere that does not spin before: up to friction (1 +
-    e) |vn|, and no more than the share k / (1 + k) at which it grips, with k its moment of inertia
-    over mass x radius^2 (2/5: solid; 2/3: a thin shell). That is right for the first impact, which
-    is the one that counts.
+    At the impact the normal velocity is reversed and multiplied by the restitution. Friction
+    reduces the tangential speed as for a sphere without initial spin: by at most friction (1 + e)
+    |vn|, and by at most the share k / (1 + k), at which it rolls, with k its moment of inertia over
+    mass x radius^2 (2/5: solid; 2/3: a thin shell). This is correct for the first impact, which is
+    the relevant one.
     """
 
     name = "bounce-shot"
@@ -104,23 +105,23 @@ class ShotSystem(System):
 
     @classmethod
     def refuses(cls, effect: type[Effect]) -> str:
-        """Effects that act along the vertical coordinate, which this frame does not have."""
+        """Refuse effects along the vertical coordinate, which this frame does not have."""
         tilted = "it acts along the vertical, and the incline is tilted"
         return tilted if effect.name in _LEVEL_ONLY else ""
 
     def mass(self, theta: Array, constants: Mapping[str, Array]) -> Array:
-        """One: force is counted per unit mass."""
+        """Return one, because force is counted per unit mass."""
         return np.ones((len(theta), 1))
 
     def weight(self, moment: Moment) -> Array:
-        """Gravity, m/s^2, in the incline's frame."""
+        """Return gravity in the incline's frame (L, 3), m/s^2."""
         angle = moment.constants["incline_angle"]
         across = np.zeros_like(angle)
         down: Array = np.concatenate([np.sin(angle), across, -np.cos(angle)], axis=1)
         return moment.gravity * down  # (1)
 
     def push(self, moment: Moment, axis: Literal["x", "y"]) -> Array:
-        """A horizontal unit vector."""
+        """Return a horizontal unit vector along `axis` in the incline's frame (L, 3)."""
         angle = moment.constants["incline_angle"]
         nothing = np.zeros_like(angle)
         if axis == "y":
@@ -130,7 +131,7 @@ class ShotSystem(System):
     def observe(
         self, x: Array, v: Array, a: Array, constants: Mapping[str, Array]
     ) -> dict[str, Array]:
-        """The centre in the room's frame."""
+        """Return the position of the centre in the world frame by channel."""
         cos = np.cos(constants["incline_angle"])
         sin = np.sin(constants["incline_angle"])
         along = x[:, :, 0]
@@ -143,17 +144,17 @@ class ShotSystem(System):
         }
 
     def floor(self, constants: Mapping[str, Array]) -> Array:
-        """Where the ball touches, measured from its release along the normal."""
+        """Return the displacement along the normal from the release to the impact, m."""
         return -constants["drop_height"] * np.cos(constants["incline_angle"])  # (2)
 
     def restitution(self, theta: Array) -> Array:
-        """The parameter."""
+        """Return the parameter `restitution`."""
         return theta[:, :1]
 
     def friction(self, constants: Mapping[str, Array]) -> Array:
-        """The constant."""
+        """Return the constant `friction`."""
         return constants["friction"]
 
     def grip(self, constants: Mapping[str, Array]) -> Array:
-        """That at which a sphere rolls: k / (1 + k)."""
+        """Return the maximum tangential impulse share, at which a sphere rolls: k / (1 + k)."""
         return constants["inertia_ratio"] / (1.0 + constants["inertia_ratio"])

@@ -1,4 +1,4 @@
-"""The world in which shots are made: MuJoCo, with physics that the planning simulator lacks.
+"""True world of the bounce shot: MuJoCo, with physics that the planning simulator lacks.
 
 A free rigid sphere flies through still air with quadratic drag and the lift of its spin,
 
@@ -6,19 +6,19 @@ A free rigid sphere flies through still air with quadratic drag and the lift of 
     lift = 1/2 rho A r omega x v                                           (2)
 
 (C_L = r omega / v; G. Robinson, I. Robinson, Physica Scripta 88, 018101, 2013,
-doi:10.1088/0031-8949/88/01/018101), by MuJoCo's fourth-order integrator. Contact takes time:
-MuJoCo's spring and damper between ball and ground act for about `CONTACT` seconds, damped for the
-restitution at that impact's speed: with damping ratio D, contact that ends when the force does
-gives
+doi:10.1088/0031-8949/88/01/018101), integrated by MuJoCo's Runge-Kutta 4. Contact takes time:
+MuJoCo's spring and damper between ball and ground act for about `CONTACT` seconds. The damping
+gives the restitution at the impact's speed: with damping ratio D, contact that ends when the force
+becomes zero gives
 
     e = exp(-D / w atan2(2 D w, 2 D^2 - 1)),        w = sqrt(1 - D^2)      for D < 1    (3)
     e = exp(-D / s log((D + s) / (D - s))),         s = sqrt(D^2 - 1)      for D > 1    (4)
 
 (T. Schwager, T. Poeschel, Phys. Rev. E 78, 051304, 2008, doi:10.1103/PhysRevE.78.051304, equation
-12). MuJoCo's friction is a convex relaxation that turns slip into lift, so contact is frictionless
-there, and Coulomb's friction acts from step to step with the normal force N that MuJoCo reports:
-the ball slides until it grips, and spins. A force f at its surface changes the slip of a sphere of
-moment of inertia k m r^2 by f (1 + 1 / k) / m a second, so that within a step h
+12). MuJoCo's friction is a convex relaxation that turns slip into lift. Therefore its contact is
+frictionless here, and Coulomb friction is applied at each step with the normal force N that MuJoCo
+reports: the ball slides until it rolls, and spins. A force f at its surface changes the slip of a
+sphere of moment of inertia k m r^2 by f (1 + 1 / k) / m per second, so that within a step h
 
     |f| = min(mu N, k / (1 + k) m |slip| / h)                              (5)
 """
@@ -36,23 +36,23 @@ from sims.base import Array, InputError
 from sims.shot.balls import BallKind
 
 AIR = 1.2
-"""kg/m^3: density of air."""
+"""Density of air, kg/m^3."""
 GRAVITY = 9.81
-"""m/s^2, downward."""
+"""Gravitational acceleration, downward, m/s^2."""
 CONTACT = 3e-3
-"""Seconds that an impact lasts: tennis balls stay for 5 ms, golf balls for 0.5 ms."""
+"""Duration of an impact in seconds; it is 5 ms for tennis balls and 0.5 ms for golf balls."""
 _FLIGHT = 1e-3
-"""Seconds of a step in flight."""
+"""Length of a step in flight, s."""
 _IMPACT = 3e-5
-"""Seconds of a step in contact: a hundred of them to an impact."""
+"""Length of a step in contact in seconds, a hundredth of an impact."""
 _IMPEDANCE = 0.9999
-"""Share of the acceleration asked for that contact gives: the largest MuJoCo allows."""
+"""Constraint impedance of the contact, the largest that MuJoCo allows."""
 _MOST_DAMPED = 60.0
-"""Damping ratio at which a ball is all but dead."""
+"""Damping ratio at which the restitution is practically zero."""
 
 
 def missing() -> str:
-    """Why this world cannot be had here; empty if it can."""
+    """Return why this world is not available here; empty if it is."""
     if importlib.util.find_spec("mujoco"):
         return ""
     return "the world needs mujoco, not installed (pip install mujoco)"
@@ -60,9 +60,7 @@ def missing() -> str:
 
 @dataclass(frozen=True)
 class Ground:
-    """What the ball falls on, a plane through the origin: its angle in radians, falling towards x,
-    and friction.
-    """
+    """Inclined plane through the origin: its angle in rad, descending towards x, and friction."""
 
     angle: float = 0.0
     friction: float = 0.3
@@ -75,14 +73,14 @@ def fly(
     times: Array,
     air: float = AIR,
 ) -> Array:
-    """The path of a ball let go at rest.
+    """Simulate the path of a ball that is released at rest.
 
     Args:
-        ball: what flies.
-        ground: what it strikes.
-        start: its centre, m; above the plane.
-        times: (T,) seconds, increasing from 0.
-        air: density, kg/m^3.
+        ball: Properties of the ball.
+        ground: Inclined plane.
+        start: Initial position of its centre above the plane, m.
+        times: (T,) sample times, increasing from 0, s.
+        air: Density of the air, kg/m^3.
 
     Returns:
         Centres (T, 3), m.
@@ -100,10 +98,9 @@ def fly(
 
 @functools.cache
 def damping_ratio(restitution: float) -> float:
-    """Damping ratio of a spring and damper that end their contact with this restitution, 0 < e <=
-    1.
-    """
-    # Restitution falls with damping; eighty halvings leave nothing but rounding.
+    """Return the damping ratio of a spring-damper contact with this restitution, 0 < e <= 1."""
+    # Bisection, because restitution decreases with damping; eighty halvings reach rounding
+    # accuracy.
     low = 0.0
     high = _MOST_DAMPED
     for _ in range(80):
@@ -113,8 +110,8 @@ def damping_ratio(restitution: float) -> float:
 
 
 def _restitution(ratio: float) -> float:
-    """Schwager and Poeschel's Eq. (12), for contact that ends when the force does."""
-    # Both forms are 0 / 0 at a damping ratio of 1, where their limit is exp(-2).
+    """Return the restitution for a damping ratio by Schwager and Poeschel, equation (12)."""
+    # Both formulas are 0 / 0 at a damping ratio of 1, where their limit is exp(-2).
     if ratio == 0.0 or abs(ratio - 1.0) < 1e-9:
         return 1.0 if ratio == 0.0 else math.exp(-2.0)
     if ratio < 1.0:
@@ -140,7 +137,7 @@ class _Flight:
         self._touches = False
 
     def gap(self, x: float, _y: float, z: float) -> float:
-        """Distance of the ball's surface from the plane."""
+        """Return the distance of the ball's surface from the plane, m."""
         return x * self._normal[0] + z * self._normal[1] - self._ball.radius
 
     def run(self, start: tuple[float, float, float], times: Array) -> Array:
@@ -154,37 +151,38 @@ class _Flight:
         return _sampled(np.array(rows), times)
 
     def _advance(self) -> None:
-        """One step, short where the ball touches or soon will."""
+        """Make one step, a short one if the ball touches the ground or soon will."""
         data = self._data
         position = data.qpos[:3].tolist()
         velocity = data.qvel.tolist()
         gap = self.gap(*position)
         rate = velocity[0] * self._normal[0] + velocity[2] * self._normal[1]
-        # Two steps ahead: one of flight must not reach into the ground.
+        # Look two steps ahead: a step of flight must not penetrate the ground.
         near = gap <= 0.0 or (rate < 0.0 and gap < -2.0 * _FLIGHT * rate)
         self._model.opt.timestep = _IMPACT if near else _FLIGHT
         if gap > 0.0:
             self._touches = False
-        # Once an impact, at the speed that it begins with: restitution is that of the whole impact.
+        # Set the damping once per impact, at its initial speed: restitution refers to the whole
+        # impact.
         if not self._touches and rate < 0.0 and gap + rate * _IMPACT <= 0.0:
             self._prepare(-rate)
         self._push(velocity)
         self._step(self._model, data)
 
     def _prepare(self, speed: float) -> None:
-        """The damping of an impact at this speed."""
+        """Set the contact damping for an impact at this speed."""
         self._touches = True
-        # Rounded, so that impacts that are all but alike share what was computed.
+        # Rounded, so that almost equal impacts share the cached result.
         ratio = damping_ratio(round(self._ball.restitution_at(speed), 9))
-        # A spring's contact is half of a period.
+        # The contact of a spring lasts half of its period.
         frequency = math.pi / CONTACT
         self._model.geom_solref[1] = -(frequency**2), -2.0 * ratio * frequency
 
     def _push(self, velocity: list[float]) -> None:
-        """Drag, lift and friction as the force and torque of the coming step."""
-        # Spin is in the ball's frame, which does not matter for a spin about y.
+        """Apply drag, lift and friction as force and torque of the next step."""
+        # The spin is in the ball's frame, which makes no difference for a spin about y.
         vx, vy, vz, wx, wy, wz = velocity
-        # Forces are held through the step, so they are those of its middle.
+        # Forces are constant during the step, so they are evaluated at its midpoint.
         vz -= 0.5 * GRAVITY * self._model.opt.timestep
         pull = -self._drag * math.sqrt(vx * vx + vy * vy + vz * vz)
         force = [  # (1) and (2)
@@ -201,7 +199,7 @@ class _Flight:
         self._data.xfrc_applied[1] = (*force, 0.0, torque, 0.0)
 
     def _rub(self, vx: float, vz: float, spin: float) -> float:
-        """Coulomb's friction down the slope, N: no more than stops the slip within the step."""
+        """Return the Coulomb friction down the slope, N; it does not reverse the slip in a step."""
         slip = vx * self._normal[1] - vz * self._normal[0] - spin * self._ball.radius
         k = self._ball.inertia_ratio
         stops = self._ball.mass * k / (1.0 + k) * abs(slip) / self._model.opt.timestep
@@ -229,8 +227,11 @@ def _mjcf(ball: BallKind, ground: Ground) -> str:
 
 
 def _sampled(rows: Array, times: Array) -> Array:
-    """Positions (T, 3) at the sample times from rows of time, position, velocity, by cubics between
-    steps.
+    """Interpolate positions (T, 3) at the sample times by cubic Hermite splines between steps.
+
+    Args:
+        rows: Time, position and velocity after each step (S, 7).
+        times: (T,) sample times, s.
     """
     from scipy.interpolate import CubicHermiteSpline
 
