@@ -194,10 +194,10 @@ def verdicts():
         return numbers[: len(NUMBER.findall(row[heading]))]
 
     assert page.table("| [ball", value) == 12 * 2 + 8
-    page.known("95 % intervals that hold", "the level")
-    page.known("so far of the library of 25 November", "which library it was")
-    page.known("In brackets 95 % intervals", "the level")
-    page.known("above 12,000 samples that lie closer than 10 ms", "bench/gap/causes/foresee.py")
+    page.known("95 % intervals that contain", "the level")
+    page.known("with the library of 25 November", "which library it was")
+    page.known("95 % intervals are in brackets", "the level")
+    page.known("Above 12,000 samples that lie closer than 10 ms", "bench/gap/causes/foresee.py")
     page.known("odds of 33 to 1", "held by the thresholds, below")
     return page
 

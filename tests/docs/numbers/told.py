@@ -303,7 +303,7 @@ def robots():
     good = {kind: rows.outcome.isin(["right", "set"]) for kind, rows in of.items()}
     alone = single.outcome == "right"
     sets = single[~alone].named
-    page.says("All {} questions of its sheet", len(told))
+    page.says("All {} cases were evaluated", len(told))
     page.says("| one cause | {} | {} |", len(single), good["single"].sum())
     page.says("| {} named alone; {} in sets", alone.sum(), len(sets))
     offsets, drags = sets.str.contains("input.bias"), sets.str.contains("actuator.damping")
@@ -312,16 +312,16 @@ def robots():
     page.says("drag at its joint ({}), a gain of an encoder", drags.sum())
     assert sets[~offsets & ~drags].tolist() == ["sensor.gain@q.elbow|sensor.eccentricity@q.elbow"]
     page.says("| nothing | {} | {} | one alarm", len(clean), good["clean"].sum())
-    page.says("of its own: what the library lacks | {} | {} |", len(foreign), good["foreign"].sum())
+    page.says("another joint, encoder slip | {} | {} |", len(foreign), good["foreign"].sum())
     unknown = (foreign.verdict == "unknown").sum()
     page.says("| {} `unknown`, {} `partial` |", unknown, (foreign.verdict == "partial").sum())
     held, count = told.intervals_holding.dropna().str.split("/", expand=True).astype(int).sum()
-    page.says("Of {} intervals {} hold the truth ({} %)", count, held, 100 * held / count)
-    page.says("takes {} s of processor time at the median, a", single.processor.median())
-    page.says("a clean one {}, what", clean.processor.median())
-    page.says("what the library lacks {}. Among", foreign.processor.median())
-    page.says("first {} clean recordings two", len(clean))
-    page.says("hung body's {} were asked again", (clean.robot == "hung-motor").sum())
+    page.says("Of {} intervals {} contain the true value ({} %)", count, held, 100 * held / count)
+    page.says("median processor time is {} s for a case with one", single.processor.median())
+    page.says("one cause, {} s for a clean one", clean.processor.median())
+    page.says("and {} s for a cause outside the library", foreign.processor.median())
+    page.says("first {} clean recordings there were two", len(clean))
+    page.says("the {} cases of the hanging body", (clean.robot == "hung-motor").sum())
     return page
 
 
