@@ -4,7 +4,7 @@
 # make test      the tests that take a few seconds each (about 6 minutes on two cores)
 # make test-all  these and the slow ones: exams, comparisons, clusters, kills (about 15 minutes)
 # make test-rest the slow ones and those that depend on recordings beside the clone
-# make check     lint, types and import rules
+# make check     lint, types, import rules and language
 # make docs      the site, to be read without a network: site/html/index.html (Python 3.11 or newer)
 # make exam      hides causes in hundreds of recordings and has explain find them (about 6 minutes; QUICK=--quick)
 # make benchmark measurements printed as ratios
@@ -80,6 +80,7 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m tests.language
 
 benchmark: $(STAMP)
 	$(BIN)/python -m tests.benchmarks.air

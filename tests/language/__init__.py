@@ -1,0 +1,1 @@
+"""Language guard: private words, docstring beginnings, commit subjects and file names."""

@@ -1,0 +1,151 @@
+"""Every check has a broken subject that it must find, and a clean one in which it finds nothing."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.language.__main__ import main
+from tests.language.checks import Glossary, check_source, check_subjects, check_tree
+from tests.language.ratchet import load_remaining, update_remaining
+
+CLEAN = '''"""Fit all candidate models with Levenberg-Marquardt."""
+
+MAX_CAUSES = 3  # Maximum number of causes in one model.
+
+
+def fit_models(batch_element: int, least_squares: bool = False) -> str:
+    """Fit the models of one batch element; `told` in backticks is code."""
+    key = "told"  # A string without a space is a key.
+    return f"{key}: at least {MAX_CAUSES} models, none of them is None"
+'''
+BROKEN = {
+    "function": ("def told_lines(): ...", "identifiers", "told", 1),
+    "class": ("class LaneCache: ...", "identifiers", "lane", 1),
+    "parameter": ("def fit(*, told): ...", "identifiers", "told", 1),
+    "constant": ("MOST_CAUSES = 3", "identifiers", "most", 1),
+    "attribute": ("def f(self):\n    self.rival = 1", "identifiers", "rival", 2),
+    "test": ("def test_what_is_told_is_kept(): ...", "identifiers", "told", 1),
+    "docstring": ('def f():\n    """Fit.\n\n    Of each lane.\n    """', "docstrings", "lane", 4),
+    "comment": ('x = "#"  # A noise that remembers.', "docstrings", "remembers", 1),
+    "two lines": ('"""Return so\nmany samples."""', "docstrings", "so many", 1),
+    "message": ('print(f"{1} is told")', "messages", "told", 1),
+    "joined": ('print("it hangs "\n      "on the data")', "messages", "hangs on", 1),
+    "beginning": ('x = 1\n"""The same of a fit."""', "beginnings", "The same", 2),
+}
+"""By name: source, and the check, word and line of its only finding."""
+
+
+@pytest.fixture(scope="module")
+def glossary() -> Glossary:
+    """Load the project's glossary."""
+    return Glossary.load()
+
+
+def write_files(root: Path, files: dict[str, str]) -> Path:
+    """Write files below a folder."""
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text, encoding="utf-8")
+    return root
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_private_words_and_beginnings_are_found(name, glossary):
+    source, check, word, line = BROKEN[name]
+    findings = list(check_source(source, "bench/subject.py", glossary))
+    assert [f[:4] for f in findings] == [(check, word, "bench/subject.py", line)]
+
+
+def test_every_word_of_the_glossary_is_found(glossary):
+    for terms in glossary._patterns.values():
+        for pattern, term in terms:
+            form = pattern.pattern.split("(?!")[0].replace(r"\s+", " ")
+            for check in term.checks:
+                found = [found for _, found, _ in glossary.find(f"x {form} y", check)]
+                assert form in found, (form, check)
+
+
+@pytest.mark.parametrize("file", ["docs/robots.md", "README.md"])
+def test_private_words_are_found_on_pages_and_not_in_their_code(file, glossary, tmp_path):
+    write_files(tmp_path, {file: "# Robots\n\n```\ntold\n```\n\nOne lane, `told`, --told.\n"})
+    findings = check_tree(tmp_path, ["docs", "README.md"], glossary)
+    assert [f[:4] for f in findings] == [("pages", "lane", file, 7)]
+    assert str(findings[0]) == f"{file}:7: word 'lane': write 'batch element'"
+
+
+def test_frequent_base_names_and_plurals_are_found(glossary, tmp_path):
+    frequent = {f"bench/{folder}/explain.py": "" for folder in "abcd"}
+    plural = {"sims/run_file.py": "", "sims/runs_file.py": ""}
+    repeatable = {f"sims/{folder}/__init__.py": "" for folder in "abcd"}
+    write_files(tmp_path, {**frequent, **plural, **repeatable})
+    findings = check_tree(tmp_path, ["bench", "sims"], glossary)
+    assert [f[:3] for f in findings] == [
+        ("file names", "frequent", "bench/d/explain.py"),
+        ("file names", "plural", "sims/runs_file.py"),
+    ]
+
+
+def test_long_subjects_after_the_commit_of_the_check_are_found(tmp_path):
+    def git(*arguments: str) -> None:
+        names = ["-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=no"]
+        subprocess.run(["git", "-C", str(tmp_path), *names, *arguments], check=True)
+
+    def commit(subject: str) -> None:
+        git("commit", "--quiet", "--allow-empty", "-m", subject)
+
+    assert check_subjects(tmp_path, None) == []  # no history
+    git("init", "--quiet")
+    commit("old: " + "x" * 80)
+    write_files(tmp_path, {"tests/language/__main__.py": "\n"})
+    git("add", ".")
+    commit("tests: add the check")
+    commit("a" * 72)
+    git("checkout", "--quiet", "-b", "side")
+    commit("side")
+    git("checkout", "--quiet", "-")
+    git("merge", "--quiet", "--no-ff", "-m", "m" * 80, "side")
+    assert check_subjects(tmp_path, None) == []
+    commit("b" * 73)
+    (finding,) = check_subjects(tmp_path, None)
+    assert finding.found == "b" * 73
+    assert check_subjects(tmp_path, "HEAD") == []
+    with pytest.raises(SystemExit, match="nowhere"):
+        check_subjects(tmp_path, "nowhere")
+
+
+def test_allowed_uses_are_dropped(glossary):
+    def kept(path: str) -> int:
+        return len(glossary.drop_allowed(check_source("def f(pieces): ...", path, glossary)))
+
+    assert kept("bench/api/explain.py") == 0
+    assert kept("bench/api/compare.py") == 1
+
+
+def test_a_clean_tree_has_no_findings_and_exit_code_0(tmp_path, capsys):
+    root = write_files(tmp_path, {"bench/model_fit.py": CLEAN, "README.md": "# Fit models\n"})
+    options = ["--root", str(root), "--remaining", str(tmp_path / "remaining.csv")]
+    assert main([*options, "bench", "README.md"]) == 0
+    assert capsys.readouterr().out == "0 findings, 0 more than remaining.csv allows\n"
+
+
+def test_one_finding_more_than_remaining_fails(tmp_path, capsys):
+    root = write_files(tmp_path, {"bench/model_fit.py": "told = 1\n"})
+    numbers = tmp_path / "remaining.csv"
+    options = ["--root", str(root), "--remaining", str(numbers), "bench"]
+    update_remaining({("identifiers", "told", "bench"): 1}, numbers)
+    assert main(options) == 0
+    write_files(root, {"bench/model_fit.py": "told = 1\ntold_lines = 2\n"})
+    assert main(options) == 1
+    assert "bench/model_fit.py:2: word 'told' in 'told_lines'" in capsys.readouterr().out
+
+
+def test_update_lowers_numbers_and_never_raises_one(tmp_path):
+    path = tmp_path / "remaining.csv"
+    lane, told, rival = (("identifiers", word, "bench") for word in ("lane", "told", "rival"))
+    update_remaining({lane: 5, told: 5}, path)
+    assert load_remaining(path) == {lane: 5, told: 5}
+    update_remaining({lane: 3, told: 7, rival: 1}, path)
+    assert load_remaining(path) == {lane: 3, told: 5}
+    update_remaining({told: 5}, path)
+    assert load_remaining(path) == {told: 5}
