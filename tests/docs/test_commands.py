@@ -39,6 +39,13 @@ def test_commands_are_taken(page, capsys):
     assert [line for line in lines if refused(line)] == []
 
 
+def test_commands_in_the_table_of_the_readme_are_taken(capsys):
+    from tests.docs.test_examples import table_commands
+
+    assert len(table_commands()) >= 17
+    assert [line for line in table_commands() if refused(line)] == []
+
+
 def named_wrongly(words):
     """What a command line names that does not exist; empty where all does, or is a user's file."""
     from bench.api.train import choose

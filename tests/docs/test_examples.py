@@ -1,14 +1,16 @@
 """What pages give to be copied works as it stands."""
 
+import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 
 import pytest
 
 from bench.problem.experiment import load
-from tests.docs.pages import blocks, tables, text_of
+from tests.docs.pages import FENCE, ROOT, blocks, quoted, section, tables, text_of
 
 SIMGAP = [sys.executable, "-m", "simgap"]
 
@@ -71,3 +73,51 @@ def test_every_attribute_and_method_of_an_own_simulator_is_on_its_page():
     own = {name for name in vars(OwnSimulator) if not name.startswith("_")}
     own |= {"name", "says", "parameters", "channels", "constants", "inputs", "states", "requires"}
     assert own - {"system", "own_engine"} <= named
+
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+SKIPPED = tuple(f"compare {first}" for first in ("ball", "pend", "bounce", "diag", "--recording"))
+"""Commands of the README's table that take minutes; `test_commands` checks that they are taken."""
+
+
+def table_commands():
+    """The commands in the README's table, in order, as words."""
+    cells = [row[2] for table in tables(section(README, "## What you can do")) for row in table]
+    lines = [text for cell in cells for text in quoted(cell)]
+    return [shlex.split(line)[1:] for line in lines if line.startswith("simgap ")]
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_readme_work_as_written_in_a_clone_that_stands_alone(tmp_path):
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    env = {k: v for k, v in os.environ.items() if k not in ("SIMGAP_DATA", "SIMGAP_ROBOTS")}
+
+    def run(words):
+        done = subprocess.run(
+            [*SIMGAP, *words], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, f"{shlex.join(words)}\n{done.stdout}{done.stderr}"
+        return done.stdout.splitlines()
+
+    four = section(README, "## Four commands")
+    parts = [(m["language"], m["text"]) for m in FENCE.finditer(four)]
+    assert [language for language, _ in parts] == ["sh", "text"] * 3
+    commands = 0
+    for (_, lines), (_, shown) in zip(parts[::2], parts[1::2], strict=True):
+        printed = []
+        for line in lines.splitlines():
+            printed += run(shlex.split(line)[1:])
+            commands += 1
+        for line in shown.splitlines():
+            assert line in [*printed, "..."]
+    assert commands == 4
+    short = [words for words in table_commands() if not " ".join(words).startswith(SKIPPED)]
+    mine = [words for words in short if words[0] != "import"]  # that needs a user's log
+    assert len(mine) >= 12
+    for words in mine:
+        run(words)
+
+
+def test_the_readme_is_short_and_has_two_pictures():
+    assert len(README.splitlines()) <= 120
+    assert README.count("![") == 2

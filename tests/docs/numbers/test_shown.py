@@ -1,7 +1,7 @@
 """What the first pages show of results is what the results are."""
 
 from tests.docs.numbers.account import Account
-from tests.docs.numbers.tables import REFERENCE, document, frame, one, rows
+from tests.docs.numbers.tables import REFERENCE, document, frame, rows
 from tests.docs.pages import blocks, section, text_of
 
 ROBOT = REFERENCE / "robot-example"
@@ -12,25 +12,12 @@ def test_the_readme_says_what_the_tables_say():
     status = frame("ball-drop/status.csv")
     targets = status[status.target.str.startswith("in-")].target.nunique()
     page.says("{} targets in each panel", targets)
-    page.says("budget {}, {} trainings", status.simulations.max(), status.seed.nunique())
-
-    def shots(method, column):
-        """Of the bounce shot, over all balls."""
-        return one("bounce-shot/table.csv", column, method=method, ball="all")
-
-    vision = "tunenet-vision"
-    page.says("Untuned {} % of {} shots", 100 * shots("nominal", "rate"), shots(vision, "shots"))
-    page.says("TuneNet on vision {} %", 100 * shots(vision, "rate"))
-    page.says("`explain` extended {} %", 100 * shots("explain", "rate"))
-    left = shots("explain", "prediction_error_mean") / shots(vision, "prediction_error_mean")
-    assert 0.63 < left < 0.70  # two thirds of the error in the predicted path
+    page.says("budget {}, two trainings", status.simulations.max())
+    assert status.seed.nunique() == 2
     page.known("Python 3.10 to 3.13", "pyproject.toml and the lock")
-    page.known("wheel for\nPython 3.10 and 3.11 on", "the package index")
     page.known("1.1 GB in place of 3.8 GB", "docs/installation.md")
-    page.known("who is best after 1, 3, 10 and all", "the keys of ranking.csv")
-    page.known("exits with 1.", "the exit code")
     page.known("(40 lines)", "the examples")
-    page.known("of your own (15)", "the examples")
+    page.known("an effect (15 lines)", "the examples")
     assert page.wrong == []
     assert page.left() == []
 
