@@ -216,7 +216,7 @@ def performance():
         return [values[heading]] if heading in values else None
 
     assert page.table("| questions | median, s", value) == 16
-    page.known("All 883 questions", "those that cannot be marked stand in no table")
+    page.known("All 883 cases", "those that cannot be marked stand in no table")
     return page
 
 
