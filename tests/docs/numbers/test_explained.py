@@ -30,10 +30,10 @@ def exam():
         summary["single"]["named as data tell"],
         summary["double"]["named as data tell"],
     )
-    page.says("no alarm (none of {})", summary["clean"]["alarms"]["of"])
+    page.says("no false alarm on {} clean recordings", summary["clean"]["alarms"]["of"])
     assert summary["clean"]["alarms"]["count"] == 0
-    page.says("Of single causes {} %", 100 * single["share"])
-    page.says("of pairs {} of {} (", double["count"], double["of"])
+    page.says("finds {} % of single hidden", 100 * single["share"])
+    page.says("Of pairs it finds {} of {},", double["count"], double["of"])
     page.says("a median of {} s", summary["seconds"]["median"])
     page.says("the slowest twentieth {} s", summary["seconds"]["p95"])
     amiss = items[(items.part == "marks") & items.outcome.isin(["unnamed", "missed"])]
@@ -41,15 +41,10 @@ def exam():
     page.says("a flexible joint at {} times", sizes["joint.flexibility"])
     page.says("a ripple at {}, a slip at {},", sizes["force.ripple"], sizes["sensor.slip"])
     page.says("a limit of the input's rate at {}", sizes["input.rate"])
-    page.known("All 883 questions, asked of one version (d961f13, 56 effects) in 10", "of that day")
-    for before in (
-        "with 55 effects (d4ff51a, 873 questions), and with 42 before",
-        "(98.6 % with 55, 98.9 with 42)",
-        "(41 and 43; other pairs",
-        "all 48 (46)",
-        "(0.7 and 4.4 with 55 effects)",
-    ):
-        page.known(before, "of the exams before, which are not kept")
+    page.known("All 883 cases were run with one version (d961f13, 56 effects) in 10", "of that day")
+    foreign = summary["foreign"]["right"]
+    page.says("outside the library all {}.", foreign["of"])
+    assert foreign["count"] == foreign["of"]
     return page
 
 
@@ -60,25 +55,24 @@ def robots():
     page.written(robots_report.page(summary))
     told = frame("robots/items.csv")
     asked = len(told) + len(summary["cannot show"])
-    page.says("sheet {}, in an order", asked)
+    page.says("the sheet of that day {} were asked", asked)
     page.known("Of the 726 questions", "the sheet of that day")
-    page.known("with 900 s at most", "how it was asked")
+    page.known("with at most 900 s", "how it was asked")
     page.known("(that of 23 November)", "how it was asked")
     page.known("(the last 39 with 1,500)", "how it was asked")
     assert len(summary["failed"]) == 3
     page.known("end in 900 s", "how it was asked")
-    page.known("the library of 24 November", "which has not been asked yet")
     between = frame("robots/transmission.csv")
     right, play = between.outcome == "right", between.question.str.contains("backlash")
     drawn = between.outcome != "not drawn"
     page.says("{} of the sheet, `transmission.csv`", len(between))
-    page.known("of later on 24 November", "which library it was")
-    page.says("{} of {} right (one cannot be drawn)", right.sum(), drawn.sum())
+    page.known("by a library of 24 November", "which library it was")
+    page.says("{} of {} are right (one cannot be sampled)", right.sum(), drawn.sum())
     assert len(between) - drawn.sum() == 1
-    page.says("of elastic joints\n{} of {}; before", right[~play].sum(), (~play).sum())
+    page.says("Of elastic joints {} of {} are right", right[~play].sum(), (~play).sum())
     page.known("ran into 900 s", "how it was asked")
-    page.says("Of play {} of {} are right", right[play].sum(), (play & drawn).sum())
-    page.says("of {} more it is named, and beside", (between.outcome == "extra").sum())
+    page.says("Of backlash {} of {} are right", right[play].sum(), (play & drawn).sum())
+    page.says("in {} more it is named together with", (between.outcome == "extra").sum())
     asked_again(page)
     return page
 
@@ -88,34 +82,35 @@ def asked_again(page):
     again = frame("robots/again.csv")
     single = again[(again.kind == "single") & (again.outcome != "not drawn")]
     rubs = again.question.str.contains("friction")
-    page.known("By the library of 25 November", "which library it was")
-    page.known("with 1,500 s at most", "how it was asked")
-    page.says("as in the middle of a step) {} of the 740", len(again))
-    page.known("of the 740 questions of today's sheet", "the sheet of that day")
-    page.says("{} s of a processor at the median", again.processor.median())
-    page.says("single causes\n{} of {} are named alone", single.strict.sum(), len(single))
+    clean = again[again.kind == "clean"]
+    opening = "names {} of {} single causes with their place, and gives no false alarm on {} clean"
+    page.says(opening, single.strict.sum(), len(single), len(clean))
+    page.known("Library of 25 November", "which library it was")
+    page.known("with at most 1,500 s", "how it was asked")
+    page.says("in the middle of a step): {} of 740", len(again))
+    page.known("of 740 questions of the sheet", "the sheet of that day")
+    page.says("{} s of processor time at the median", again.processor.median())
+    page.says("single causes {} of {} are named alone", single.strict.sum(), len(single))
     page.says("{} alone or in a set of at most", single.few.sum())
     page.known("a set of at most 4, 151", "`score.FEW`")
     page.says("{} ({} %) alone or in a set whose", single.fair.sum(), 100 * single.fair.mean())
     held, count = again.held.sum(), again.intervals.sum()
-    page.says("of {} intervals {} hold ({} %", count, held, 100 * held / count)
+    page.says("Of {} intervals {} hold ({} %", count, held, 100 * held / count)
     low, high = (100 * share for share in wilson(int(held), int(count)))
-    page.says("%, {} to {}: the mark", low, high)
-    page.says("frictions {} of {}, where", again[rubs].held.sum(), again[rubs].intervals.sum())
-    page.known("where it had been 78 %", "of the exam before")
-    clean = again[again.kind == "clean"]
+    page.says("%, {} to {})", low, high)
+    page.says("frictions {} of {}.", again[rubs].held.sum(), again[rubs].intervals.sum())
     assert (clean.outcome == "right").all()
     page.says("Of {} clean recordings none", len(clean))
     # what none of n says with 95 % confidence: (1 - share)^n = 0.05
-    page.says("they are fewer than {} %, where", 100 * (1 - 0.05 ** (1 / len(clean))))
-    page.known("an alarm: with 95 % confidence", "as the share below")
-    page.known("where 1 % is the mark", "issue and page say it")
-    page.says("are answered in {} s of", clean.processor.median())
+    page.says("fewer than {} %; the goal", 100 * (1 - 0.05 ** (1 / len(clean))))
+    page.known("alarm (with 95 % confidence", "as the share below")
+    page.known("the goal is 1 %", "issue and page say it")
+    page.says("take {} s of processor", clean.processor.median())
     pairs, foreign = (again[again.kind == kind] for kind in ("double", "foreign"))
     count, found = len(pairs), pairs.fair.sum()
     page.says("Of {} pairs {} are right ({} %)", count, found, 100 * found / count)
-    page.says("of {} foreign causes, taken in no order, {}; the", len(foreign), foreign.fair.sum())
-    page.says("the others, {} and {}, take hours", 36 - len(pairs), 72 - len(foreign))
+    page.says("Of {} causes outside the library all {}; the", len(foreign), foreign.fair.sum())
+    page.says("the others, {} and {}, would take hours", 36 - len(pairs), 72 - len(foreign))
     page.known("of the iiwa that is 25 % too soft", "what was hidden")
     page.known("(7 to 14 and 45 of its standard deviations)", "of verdicts that are not kept")
 
@@ -125,18 +120,15 @@ def next_recording():
     page = Account("results/reference/next-recording/README.md")
     sets, fresh = frame("next-recording/sets.csv"), frame("next-recording/fresh.csv")
     told, kept = said(sets), sets.kept & sets.outcome.isin(["settled", "split"])
-    page.says("of {} sets |", len(sets))
-    page.says("said to be told | 12 | {} |", told.sum())
-    page.known("| said to be told | 12", "of the code before")
-    page.says("and told, the truth kept | 5 | {} |", (told & kept).sum())
-    page.known("and told, the truth kept | 5", "of the code before")
-    page.says("no run of this kind | 12 | {} |", (~told).sum())
-    page.known("by no run of this kind | 12", "of the code before")
-    page.says("of {} {} were said to be told", len(fresh), said(fresh).sum())
+    page.says("in {} of {} cases, and", (told & kept).sum(), told.sum())
+    page.says("`simgap design` | of {} sets |", len(sets))
+    page.says("a run distinguishes the causes | {} |", told.sum())
+    page.says("and it did, the true cause kept | {} |", (told & kept).sum())
+    page.says("this kind distinguishes them | {} |", (~told).sum())
+    page.says("of {} {} were predicted to be", len(fresh), said(fresh).sum())
     assert (fresh.kept & (fresh.outcome == "settled"))[said(fresh)].all()
     rest = fresh[~said(fresh)].outcome.value_counts()
-    page.says("of the {} that no run was said", rest.sum())
-    page.says("to tell {} were split", rest["split"])
+    page.says("Of the {} others {} were split", rest.sum(), rest["split"])
     page.says("{} stayed open, none was lost", rest["open"])
     untold = sets[~told]
     page.says(
@@ -158,10 +150,10 @@ def next_recording():
         (worth,) = (most[i] for i in untold.index if member in members(untold.groups[i]))
         page.says(f"{words} | {{}} |", worth)
     page.known("a gain of 0.7 %", "the truth of that question")
-    page.known("drawn by seed 0, the first 24", "how it was asked")
+    page.known("sampled with seed 0: the first 24", "how it was asked")
     page.known("4 s or up to 20 s", "how it was asked")
-    page.known("begun up to 1 %", "how it was asked")
-    page.known("of the 25 squared noises", "the threshold of design")
+    page.known("started up to 1 %", "how it was asked")
+    page.known("; 25 squared noises are", "the threshold of design")
     return page
 
 

@@ -75,6 +75,8 @@ def _marks(page):
     reached = [error("tunenet", kind, 3) for kind in ("in", "wide")]
     seeds = frame("ball-drop/training.csv").query("tuner == 'tunenet'")
     page.says("| {} and {} ({} trainings, [", *reached, len(seeds))
+    first = "reaches {} after three simulations in range, the published network {}."
+    page.says(first, reached[0], error("tunenet-published", "in", 3))
     for kind, words in (("in", "after 1 / 3 / 5"), ("wide", "wide")):
         of = [error("tunenet-published", kind, k) for k in (1, 3, 5)]
         page.says(f"{words} | {{}} / {{}} / {{}} |", *of)
@@ -128,9 +130,9 @@ def _misspecified(page):
         return one("misspecified/learned.csv", "error", **where)
 
     page.says(
-        "`regressor` errs by {} training widths and not {} on a bounce shot whose restitution "
-        "falls with speed, and by {} and not {} on a ball with drag; `tunenet` by {} and not {} on "
-        "the ball, and on the shot by {} and {}: no gain",
+        "`regressor` errs by {} training widths instead of {} on a bounce shot whose restitution "
+        "falls with speed, and by {} instead of {} on a ball with drag - `tunenet` errs by {} "
+        "instead of {} on the ball; on the shot by {} instead of {}, which is no gain",
         *(error("shot", "regressor", told) for told in (True, False)),
         *(error("ball", "regressor", told) for told in (True, False)),
         *(error("ball", "tunenet", told) for told in (True, False)),
@@ -178,8 +180,8 @@ def _history(page):
     both = "in_context", "tunenet"
     page.says("in range {} against `tunenet`'s {}, on", *error(drop, "in", 1, *both))
     page.says("on `pendulum-swing` {} against {}, outside", *error(swing, "in", 1, *both))
-    page.says("outside its range {} against {}; on", *error(swing, "wide", 1, *both))
-    page.says("range it loses, {} against {}.", *error(drop, "wide", 1, *both))
+    page.says("outside its range {} against {}. On", *error(swing, "wide", 1, *both))
+    page.says("range it is worse, {} against {}.", *error(drop, "wide", 1, *both))
     page.says(
         "`hybrid` is at {} after 20 simulations of the pendulum where it is at {}.",
         *error(swing, "in", 20, "hybrid", "in_context"),
@@ -188,10 +190,10 @@ def _history(page):
     page.says("as good: {} against {} after three", *error(drop, "in", 3, *windows))
     page.says("of `ball-drop`, {} against {} on", *error(swing, "in", 3, *windows))
     ends = [error(name, "in", 20, "published-3")[0] for name in (drop, swing)]
-    page.says("most of it**: {} and {} after 20", *ends)
-    page.says("{} widths on the shot and {} on the ball; ", *mended("in_context", "plain"))
-    page.says("makes that {} and {}, and", *mended("in_context", "extended"))
-    page.says("there errs by {} and {}.", *mended("least_squares", "extended"))
+    page.says("most of the loss**: {} and {} after 20", *ends)
+    page.says("{} widths on the shot and {} on the ball. ", *mended("in_context", "plain"))
+    page.says("the errors are {} and {}, and", *mended("in_context", "extended"))
+    page.says("those of `least_squares` {} and {}.", *mended("least_squares", "extended"))
 
 
 def performance():
@@ -214,7 +216,7 @@ def performance():
         return [values[heading]] if heading in values else None
 
     assert page.table("| questions | median, s", value) == 16
-    page.known("All 883 questions", "those that cannot be marked stand in no table")
+    page.known("All 883 cases", "those that cannot be marked stand in no table")
     return page
 
 
